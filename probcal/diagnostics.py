@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pandas as pd
 import xarray as xr
 
 from probcal.status import Status
-
-if TYPE_CHECKING:
-    pass
 
 
 def grid_of(study: xr.Dataset) -> list[str]:
@@ -46,8 +41,7 @@ def comparison_rows(comparison: xr.DataTree) -> pd.DataFrame:
     """A comparison as a long table: method, other, bias, quantity, value; other and bias may be empty."""
     estimate = comparison["estimate"].to_dataset()
     columns = ["method", "other", "bias", "quantity", "value"]
-    parts = [estimate[[n for n in estimate.data_vars if n != "status"]].drop_vars(["unit", "scale"])]
-    parts[0] = parts[0].rename(estimator="method")
+    parts = [estimate.drop_vars(["status", "unit", "scale"]).rename(estimator="method")]
     parts.append(comparison["pair"].to_dataset().rename(first="method", second="other"))
     for name in estimate["estimator"].values:
         parts.append(comparison[f"method/{name}"].to_dataset().assign_coords(method=str(name)))

@@ -63,6 +63,16 @@ def listed(names: Sequence[str], most: int = 4) -> str:
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
+def coordinates(names: Collection[str] | None = None, of: str = "") -> list[str]:
+    """Names of the coordinates of a position among some names, `of` an owner where that is given.
+
+    >>> coordinates(["position_x", "position_y", "velocity_x"]), coordinates(of="mast")[2]
+    (['position_x', 'position_y'], 'mast.position_z')
+    """
+    found = [f"{of}.position_{axis}" if of else f"position_{axis}" for axis in AXES]
+    return found if names is None else [name for name in found if name in names]
+
+
 def label_parts(label: str) -> tuple[str, str]:
     """Owner and bias of a label: `mic_3` and `position_x`, `radar_2` and `heading@0.5` of a step."""
     constant, _, time = label.rpartition("@")

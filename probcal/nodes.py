@@ -16,7 +16,7 @@ import numpy as np
 from probcal.errors import InputError, nearest
 from probcal.files import parsed_json, write_whole
 from probcal.geodesy import GEODETIC, LocalFrame, check_place, earth_axes
-from probcal.labels import AXES, step_of, unescaped
+from probcal.labels import coordinates, step_of, unescaped
 from probcal.lazy import Later
 from probcal.network import ANGLES, POSE_UNITS, Network, Node
 from probcal.sensor import Bias
@@ -181,9 +181,7 @@ def _place_columns(table: Table, cells: pd.DataFrame) -> tuple[str, ...]:
 
 def _stated_place(table: Table, column: pd.Series, name: str, unit: str | None) -> np.ndarray:
     values, there = numbers(table, column, name)
-    blank = np.flatnonzero(~there)
-    if len(blank):
-        raise InputError(f'{table.where(blank[0])} column "{name}" is blank; state it for every node')
+    table.refuse(~there, name, " is blank; state it for every node")
     return values * unit_factor(table, name, unit, PLACE_UNITS[name])
 
 
@@ -364,9 +362,7 @@ def write_nodes(
 
 def _left_out(tree: xr.DataTree, written: int) -> str:
     """The sentence that says what of a fit a map of its nodes lacks; empty where it lacks nothing."""
-    sensors = (
-        int((tree["calibration"]["sensor_type"] != "").sum()) if "sensor_type" in tree["calibration"].coords else 0
-    )
+    sensors = int((tree["calibration"]["sensor_type"] != "").sum())
     nodes = tree["constant_data"].sizes["node"] - written
     counts = ((sensors, "biases of sensors"), (nodes, "nodes that move or drift"))
     left = ", ".join(f"{what} ({count})" for count, what in counts if count)
@@ -401,23 +397,23 @@ def _calibrated(tree: xr.DataTree) -> list[_Record]:
         raise InputError("the tree holds no calibrated nodes; give the result of fit()")
     constant, found = tree["constant_data"].to_dataset(), tree["calibration"].to_dataset()
     table = found[["mean", "sd", "unit"]].to_dataframe().to_dict("index")
-    fixed = constant["fixed"].to_series().to_dict() if "fixed" in constant else {}
-    shift: dict[str, float] = fixed | {label: row["mean"] for label, row in table.items()}
-    stated = zip(*(constant[name].values for name in ("stated_node", "stated_component", "stated")), strict=True)
-    components: dict[str, dict[str, float]] = {}
-    for node, component, value in stated:
-        components.setdefault(str(node), {})[str(component)] = float(value) + shift.get(f"{node}.{component}", 0.0)
+    shift: dict[Any, float] = constant["fixed"].to_series().to_dict() if "fixed" in constant else {}
+    shift |= {label: row["mean"] for label, row in table.items()}
+    steps = [step_of(label, shift) for label in shift]
+    drifting = {step[0] for step in steps if step is not None}
+    stated = constant[["stated_node", "stated_component", "stated"]].to_dataframe()
     records = []
     for node, place, moving in zip(*(constant[n].values for n in ("node", "node_position", "moving")), strict=True):
-        axes = [f"position_{axis}" for axis in AXES[: len(place)]]
-        own = {name: table[f"{node}.{name}"] for name in (*axes, *components[node]) if f"{node}.{name}" in table}
-        position = place + [shift.get(f"{node}.{axis}", 0.0) for axis in axes]
-        further = {f"sd_{name}": row["sd"] for name, row in own.items()}
-        units = {name: row["unit"] for name, row in own.items() if name not in axes}
-        names = {f"{node}.{name}" for name in (*axes, *components[node])}
-        drifts = any((step := step_of(label, shift)) is not None and step[0] in names for label in shift)
-        if not moving and not drifts:
-            records.append(_Record(str(node), position, components[node], further, units))
+        axes = coordinates()[: len(place)]
+        rows = stated.loc[stated["stated_node"] == node, ["stated_component", "stated"]].itertuples(index=False)
+        components = {str(name): value + shift.get(f"{node}.{name}", 0.0) for name, value in rows}
+        labels = {name: f"{node}.{name}" for name in (*axes, *components)}
+        own = {name: table[label] for name, label in labels.items() if label in table}
+        if not moving and drifting.isdisjoint(labels.values()):
+            position = place + [shift.get(labels[axis], 0.0) for axis in axes]
+            further = {f"sd_{name}": row["sd"] for name, row in own.items()}
+            units = {name: row["unit"] for name, row in own.items() if name not in axes}
+            records.append(_Record(str(node), position, components, further, units))
     return records
 
 

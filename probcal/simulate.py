@@ -15,7 +15,7 @@ import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.files import write_whole
-from probcal.labels import AXES, NOBODY, unescaped
+from probcal.labels import NOBODY, coordinates, listed, unescaped
 from probcal.lazy import Later
 from probcal.model import rows
 from probcal.model.sampled import path
@@ -77,8 +77,8 @@ class Truth:
         targets = list(dict.fromkeys(map(str, names)))
         if len(targets) > 1:
             raise InputError(
-                f'truth {self.source} has no column "target", by which {len(targets)} targets ({", ".join(targets[:3])}'
-                f"{', ...' if len(targets) > 3 else ''}) are told apart; add it"
+                f'truth {self.source} has no column "target", by which {len(targets)} targets'
+                f" ({listed(targets, 3)}) are told apart; add it"
             )
 
     def positions(self, time: np.ndarray, target: np.ndarray, dimension: int) -> np.ndarray:
@@ -90,17 +90,14 @@ class Truth:
         found = np.full((len(time), dimension), np.nan)
         if not isinstance(self.tracks, pd.DataFrame):
             return found
-        columns = [f"position_{axis}" for axis in AXES[:dimension]]
+        columns = coordinates()[:dimension]
         if columns[-1] not in self.tracks:
             raise InputError(f'truth: the tracks have no column "{columns[-1]}", the network is {dimension}-D')
-        owners = self.tracks["target"].map(name_as_text).to_numpy() if "target" in self.tracks else None
-        known, places = self.tracks["time"].to_numpy(float), self.tracks[columns].to_numpy(float)
         for name in np.unique(target):
-            rows = slice(None) if owners is None else owners == name
-            at, own = known[rows], places[rows]
-            if len(at):
-                mine, order = target == name, np.argsort(at, kind="stable")
-                found[mine] = _interpolated(time[mine], at[order], own[order])
+            own = _track_of(self.tracks, name)
+            if len(own):
+                rows, known = target == name, own["time"].to_numpy(float)
+                found[rows] = _interpolated(time[rows], known, own[columns].to_numpy(float))
         return found
 
     def track(self, target: str, time: np.ndarray) -> pd.DataFrame | None:
@@ -110,12 +107,9 @@ class Truth:
         """
         if not isinstance(self.tracks, pd.DataFrame):
             return None
-        track = self.tracks
-        if "target" in track:
-            track = track[track["target"].map(name_as_text) == target]
+        track = _track_of(self.tracks, target)
         if not len(track):
             return None
-        track = track.sort_values("time")
         values = track.drop(columns=["time", "target"], errors="ignore").apply(pd.to_numeric, errors="coerce")
         values = values.dropna(axis=1)
         known = track["time"].to_numpy(float)
@@ -132,14 +126,16 @@ class Simulation:
     def write(self, path: str | PathLike[str]) -> list[Path]:
         """Write PATH and, beside it, PATH's `.tracks.csv` and `.biases.csv`; returns the files."""
         path = Path(path)
-        tracks, biases = _beside(path)
-        tables: list[tuple[Path, Any]] = [(path, self.table), (tracks, self.truth.tracks)]
-        tables.append(
-            (biases, pd.DataFrame({"bias": list(self.truth.biases), "value": list(self.truth.biases.values())}))
-        )
-        for target, frame in tables:
-            write_whole(target, csv_text(frame))
-        return [target for target, _ in tables]
+        biases = pd.DataFrame(self.truth.biases.items(), columns=["bias", "value"])
+        tables: Any = zip([path, *_beside(path)], [self.table, self.truth.tracks, biases], strict=True)
+        return [write_whole(target, csv_text(frame)) for target, frame in tables]
+
+
+def _track_of(tracks: pd.DataFrame, target: str) -> pd.DataFrame:
+    """Rows of the track of a target in order of time."""
+    named = "target" in tracks
+    own = tracks[tracks["target"].map(name_as_text) == target] if named else tracks
+    return own.sort_values("time", kind="stable")
 
 
 def _interpolated(time: np.ndarray, known: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -154,10 +150,9 @@ def _interpolated(time: np.ndarray, known: np.ndarray, values: np.ndarray) -> np
 def truth_beside(path: str | PathLike[str]) -> Truth | None:
     """Truth that `Simulation.write` left beside a table, or None."""
     tracks, biases = _beside(Path(path))
-    if not tracks.exists() and not biases.exists():
-        return None
     values = _biases_of(read_table(biases)) if biases.exists() else {}
-    return Truth(tracks if tracks.exists() else None, values)
+    there = tracks if tracks.exists() else None
+    return Truth(there, values) if there or biases.exists() else None
 
 
 def _beside(path: Path) -> tuple[Path, Path]:
@@ -272,17 +267,17 @@ def _detections(
             chance = np.where(mine, chance * np.asarray(seen, float), chance)
         kept[index] = rng.uniform(size=len(index)) < chance
     detects = plan["sensor"].map(lambda name: placed[str(name)].detection is not None).to_numpy(bool)
-    there = ~np.stack([np.isnan(column) for column in columns.values()]).all(0)
-    found = plan.loc[there & kept & ~detects, [c for c in ("time", "sensor", "target") if c in plan]]
-    found = found.assign(**{name: column[found.index] for name, column in columns.items()})
-    reported = plan.loc[there & kept & detects, ["time", "sensor"]]
-    reported = reported.assign(**{name: column[reported.index] for name, column in columns.items()})
+    measured = pd.DataFrame(columns)
+    there = measured.notna().any(axis=1).to_numpy()
+    named = [column for column in ("time", "sensor", "target") if column in plan]
+    found = plan.loc[there & kept & ~detects, named].join(measured)
+    reported = plan.loc[there & kept & detects, ["time", "sensor"]].join(measured)
     parts = [found, reported]
     for (time, name), _ in plan[detects].groupby(["time", "sensor"], sort=False):
         own, kind = placed[str(name)].detection, placed[str(name)].type
         assert own is not None
         count = rng.poisson(own.rate)
-        false = {}
+        false: dict[str, Any] = {"time": np.full(count, time), "sensor": np.full(count, name, object)}
         for channel, declared in kind.expand(network.dimension):
             pair = own.within(channel, declared.unit, declared.period)
             if pair is None and own.rate:
@@ -292,7 +287,7 @@ def _detections(
                 )
             low, high = pair or (0.0, 0.0)
             false[channel] = declared.turned(rng.uniform(low, high, size=count))
-        parts.append(pd.DataFrame({"time": np.full(count, time), "sensor": np.full(count, name, object), **false}))
+        parts.append(pd.DataFrame(false))
         if not count and not ((reported["time"] == time) & (reported["sensor"] == name)).any():
             parts.append(pd.DataFrame({"time": [time], "sensor": [name]}))
     whole = pd.concat([part for part in parts if len(part)], ignore_index=True)
@@ -309,9 +304,9 @@ def _drawn(
 
 
 def _plan(network: Network, time: np.ndarray, targets: list[str]) -> pd.DataFrame:
-    names = [placed.name for placed in network.sensors]
-    grid = [(t, sensor, target) for target in targets for t in time for sensor in names]
-    plan = pd.DataFrame(grid, columns=["time", "sensor", "target"])
+    sensors = [placed.name for placed in network.sensors]
+    grid = pd.MultiIndex.from_product([targets, time, sensors], names=["target", "time", "sensor"])
+    plan = grid.to_frame(index=False)[["time", "sensor", "target"]]
     detects = any(placed.detection is not None for placed in network.sensors)  # whose rows would lose the name
     return plan if detects or targets != ["target"] else plan.drop(columns="target")
 
@@ -353,24 +348,19 @@ def _states(problem: Problem, r: int, tracks: Mapping[str, Any], key: jax.Array)
     noise = np.asarray(problem.model.draw_noises(key, r, 1))[:, :, 0]
     F, L, drift = (np.asarray(a) for a in (part.F, part.L, part.drift))
     states: Any = np.zeros_like(noise)
-    previous = np.zeros(noise.shape[1])
     for e in range(len(noise)):
-        previous = F[e] @ previous + drift[e] + L[e] @ noise[e]
-        states[e] = previous
+        states[e] = F[e] @ states[e - 1] + drift[e] + L[e] @ noise[e]  # of the first the one before is zero
     sampled = problem.model.sampled[r]
     if sampled is not None:
         seed = jax.random.fold_in(jax.random.fold_in(key, r), 1)
         others = path(sampled, part.first, part.dt, seed, np.zeros(len(problem.levels)))
         states = np.asarray(problem.model.vectors(r, sampled.whole(states, others)))
-    count = {name: int((epochs.target == name).sum()) for name in tracks}
-    frames = {
-        name: _frame(
-            track(epochs.time[epochs.target == name]) if callable(track) else track,
-            problem.network.dimension, count[name], name,
-        )
-        for name, track in tracks.items()
-        if count[name]
-    }  # fmt: skip
+    times = {name: epochs.time[epochs.target == name] for name in tracks}
+    frames = {}
+    for name, track in tracks.items():
+        if len(at := times[name]):
+            given = track(at) if callable(track) else track
+            frames[name] = _frame(given, problem.network.dimension, len(at), name)
     return on_tracks(epochs, states, frames)
 
 
@@ -415,7 +405,7 @@ def _frame(track: Any, dimension: int, epochs: int, name: str) -> pd.DataFrame:
         array = np.atleast_2d(np.asarray(track, float))
         if array.shape[1] != dimension:
             raise InputError(f'simulate: track "{name}" has shape {array.shape}, expected (times, {dimension})')
-        track = pd.DataFrame(array, columns=[f"position_{axis}" for axis in AXES[:dimension]])
+        track = pd.DataFrame(array, columns=coordinates()[:dimension])
     if len(track) != epochs:
         raise InputError(f'simulate: track "{name}" has {len(track)} positions for {epochs} epochs')
     return track

@@ -62,6 +62,13 @@ class Table:
         in the frame."""
         return f"{self.source} {self.word} {self.lines[row]}"
 
+    def refuse(self, wrong: np.ndarray, column: str, why: str, values: Any = ()) -> None:
+        """Raise `InputError` for the first of some rows (N,) bool; `why` is formatted with its value (N,), if given."""
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            text = why.format(values[row]) if len(values) else why
+            raise InputError(f'{self.where(row)} column "{column}"{text}')
+
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
@@ -207,7 +214,8 @@ def measure(table: Table, network: Network, *, repeated: bool = False) -> Measur
             value[:, j], measured[:, j] = numbers(table, cells, name)
         if f"{name}_std" in names:
             std[:, j], has_std[:, j] = numbers(table, frame[f"{name}_std"], f"{name}_std")
-        _check_stds(table, f"{name}_std", std[:, j], has_std[:, j])
+        small = has_std[:, j] & (std[:, j] < 1 / LARGEST)
+        table.refuse(small, f"{name}_std", ": std is {:g}; it must be positive, 1e-100 or more", std[:, j])
         _to_channel(table, network, name, j, sensor, units, value, std, measured, below, floors)
     own = has_std & measured
     result = Measurements(
@@ -281,17 +289,10 @@ def _float(cell: Any) -> float:
 def numbers(table: Table, column: pd.Series, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Values (N,) with zeros where blank, and which are there; raises `InputError` naming row and column."""
     found = _floats(column)
-    text = np.flatnonzero(np.isnan(found) & column.notna().to_numpy())
-    if len(text):
-        raise InputError(
-            f'{table.where(text[0])} column "{name}": "{column.iloc[text[0]]}" is no number; leave it blank'
-        )
-    infinite = np.flatnonzero(np.isinf(found))
-    if len(infinite):
-        raise InputError(f'{table.where(infinite[0])} column "{name}": the value is infinite; leave it blank')
-    large = np.flatnonzero(np.abs(found) > LARGEST)
-    if len(large):
-        raise InputError(f'{table.where(large[0])} column "{name}": {found[large[0]]:g} is too large; leave it blank')
+    text = np.isnan(found) & column.notna().to_numpy()
+    table.refuse(text, name, ': "{}" is no number; leave it blank', column.to_numpy())
+    table.refuse(np.isinf(found), name, ": the value is infinite; leave it blank")
+    table.refuse(np.abs(found) > LARGEST, name, ": {:g} is too large; leave it blank", found)
     there = ~np.isnan(found)
     return np.where(there, found, 0.0), there
 
@@ -300,12 +301,8 @@ def _times(table: Table, column: pd.Series, unit: str | None) -> np.ndarray:
     values = _floats(column)
     if np.isnan(values).all() and column.notna().any():  # durations or dates
         values, unit = _seconds(column), None
-    bad = np.flatnonzero(~(np.abs(values) <= LARGEST))
-    if len(bad):
-        given = column.iloc[bad[0]]
-        raise InputError(
-            f'{table.where(bad[0])} column "time": {given} is not a finite time; give seconds or ISO dates'
-        )
+    wrong = ~(np.abs(values) <= LARGEST)
+    table.refuse(wrong, "time", ": {} is not a finite time; give seconds or ISO dates", column.to_numpy())
     quantity, factor = UNITS[unit or "s"]
     if quantity != "time":
         raise InputError(f'{table.source} column "time": unit "{unit}" is not a time; use s, ms, us, ns, min or h')
@@ -384,12 +381,10 @@ def _targets(
     else:
         text = pd.Series(names_as_text(column), dtype=object)
         blank = column.isna().to_numpy() | (text == "").to_numpy()
-        wrong = np.flatnonzero(blank & ~detecting & reading)
-        if len(wrong):
-            raise InputError(
-                f'{table.where(wrong[0])} column "target" is blank; name the target or drop the column, or place the'
-                " sensor with detection=Detection(...)"
-            )
+        table.refuse(
+            blank & ~detecting & reading, "target",
+            " is blank; name the target or drop the column, or place the sensor with detection=Detection(...)",
+        )  # fmt: skip
         same = np.flatnonzero((text == OBJECT).to_numpy())
         if (blank & detecting).any() and len(same):
             raise InputError(f'{table.where(same[0])}: "{OBJECT}" stands for the detections; rename the target')
@@ -407,17 +402,9 @@ def _weights(table: Table, column: pd.Series | None) -> np.ndarray:
     if column is None:
         return np.ones(len(table.frame))
     value, there = numbers(table, column, "weight")
-    bad = np.flatnonzero(there & ~((value >= 0) & (value <= 1)))
-    if len(bad):
-        raise InputError(f'{table.where(bad[0])} column "weight": {value[bad[0]]:g} does not lie between 0 and 1')
+    wrong = there & ~((value >= 0) & (value <= 1))
+    table.refuse(wrong, "weight", ": {:g} does not lie between 0 and 1", value)
     return np.where(there, value, 1.0)
-
-
-def _check_stds(table: Table, name: str, std: np.ndarray, given: np.ndarray) -> None:
-    bad = np.flatnonzero(given & (std < 1 / LARGEST))
-    if len(bad):
-        value = f"{std[bad[0]]:g}"
-        raise InputError(f'{table.where(bad[0])} column "{name}": std is {value}; it must be positive, 1e-100 or more')
 
 
 def _to_channel(
@@ -451,13 +438,11 @@ def _to_channel(
         if isinstance(channel.noise, Censored) and channel.noise.blanks:
             blank = (kinds == k) & ~measured[:, j]
             value[blank, j], measured[blank, j] = channel.noise.floor, True
-        _check_limits(table, name, channel, value[:, j], np.flatnonzero(rows & below))
-        wrong = np.flatnonzero(rows & ~channel.noise.check(value[:, j]))
-        if len(wrong):
-            shown = f'{table.where(wrong[0])} column "{name}": {value[wrong[0], j]:g}'
-            if isinstance(channel.noise, Bernoulli):
-                raise InputError(f"{shown} is not 0 or 1")
-            raise InputError(f"{shown} does not suit {channel.noise!r}; leave it blank, or move the floor below it")
+        _check_limits(table, name, channel, value[:, j], rows & below)
+        wrong = rows & ~channel.noise.check(value[:, j])
+        unfit = f"does not suit {channel.noise!r}; leave it blank, or move the floor below it"
+        unfit = "is not 0 or 1" if isinstance(channel.noise, Bernoulli) else unfit
+        table.refuse(wrong, name, f": {{:g}} {unfit}", value[:, j])
 
 
 def _limits(column: pd.Series) -> tuple[pd.Series, np.ndarray]:
@@ -472,18 +457,14 @@ def _limits(column: pd.Series) -> tuple[pd.Series, np.ndarray]:
 
 
 def _check_limits(table: Table, name: str, channel: Channel, value: np.ndarray, below: np.ndarray) -> None:
-    """Raise `InputError` for limits of a channel that hears all, or above its floor."""
-    if not len(below):
-        return
-    shown = f'{table.where(below[0])} column "{name}": "<{value[below[0]]:g}"'
+    """Raise `InputError` for limits (N,) bool of a channel that hears all, or above its floor."""
     if not isinstance(channel.noise, Censored):
-        raise InputError(f"{shown} is a limit, but the channel hears all; declare it with noise=Censored(floor)")
-    high = below[value[below] > channel.noise.floor]
-    if len(high):
-        raise InputError(
-            f'{table.where(high[0])} column "{name}": "<{value[high[0]]:g}" lies above the floor'
-            f" {channel.noise.floor:g} of its channel; declare the highest limit of such sensors as their floor"
-        )
+        limit = ': "<{:g}" is a limit, but the channel hears all; declare it with noise=Censored(floor)'
+        table.refuse(below, name, limit, value)
+        return
+    floor = channel.noise.floor
+    above = f"lies above the floor {floor:g} of its channel; declare the highest limit of such sensors as their floor"
+    table.refuse(below & (value > floor), name, f': "<{{:g}}" {above}', value)
 
 
 def unit_factor(table: Table, name: str, unit: str | None, wanted: str) -> float:
@@ -499,27 +480,18 @@ def unit_factor(table: Table, name: str, unit: str | None, wanted: str) -> float
 
 
 def _check_duplicates(data: Measurements, network: Network) -> None:
-    some = np.flatnonzero(data.measured.any(1) & ~data.detection)
-    keys = [column[some] for column in (data.target, data.sensor, data.time)]
-    order = np.lexsort(keys)
-    if len(some) < 2 or not np.all([np.diff(key[order]) == 0 for key in keys], 0).any():
+    keys = ["time", "sensor", "target"]
+    frame = pd.DataFrame({name: getattr(data, name) for name in (*keys, "weight")})[~data.detection]
+    if not frame[data.measured.any(1)[frame.index]].duplicated(keys).any():
         return
     for j, name in enumerate(data.channels):
-        rows = np.flatnonzero(data.measured[:, j] & ~data.detection)
-        columns = (data.time[rows], data.sensor[rows], data.target[rows])
-        frame = pd.DataFrame(dict(zip(("time", "sensor", "target"), columns, strict=True)))
-        repeated = np.flatnonzero(frame.duplicated().to_numpy())
-        if len(repeated) and (data.weight[rows] < 1).any():  # shares of one datum add up to one at most
-            total = frame.assign(w=data.weight[rows]).groupby(["time", "sensor", "target"])["w"].transform("sum")
-            repeated = repeated[total.to_numpy()[repeated] > 1 + 1e-3]
-        if len(repeated):
-            again = rows[repeated[0]]
-            same = (
-                (data.time == data.time[again])
-                & (data.sensor == data.sensor[again])
-                & (data.target == data.target[again])
-            )
-            first = int(np.flatnonzero(same & data.measured[:, j])[0])
+        own = frame[data.measured[frame.index, j]]
+        repeated = own.duplicated(keys)
+        if repeated.any() and (own["weight"] < 1).any():  # shares of one datum add up to one at most
+            repeated &= own.groupby(keys)["weight"].transform("sum") > 1 + 1e-3
+        if repeated.any():
+            again: Any = repeated.idxmax()
+            first = (own[keys] == own.loc[again, keys]).all(axis=1).idxmax()
             raise InputError(
                 f'{data.table.where(again)}: sensor "{network.sensors[data.sensor[again]].name}" has a second '
                 f'"{name}" at time {data.time[again]:g} (first in row {data.table.lines[first]}); keep one, '

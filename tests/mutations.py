@@ -228,7 +228,7 @@ MUTATIONS = [
     Mutation("min((chunk - self.begin + 1) * size", "min((chunk - self.begin) * size", "test_mixing.py"),
     Mutation("self.storage.numbers[first:last])", "self.storage.numbers[first:last][:-1] or self.storage.numbers)", "test_storage.py"),
     # analysis/
-    Mutation("elif not status.settled:", "elif status is Status.DIVERGED:", "test_guards.py"),
+    Mutation("(not status.settled, ", "(status is Status.DIVERGED, ", "test_guards.py"),
     Mutation("(gamma + inflation * (1.0 - gamma))", "gamma", "test_assess.py"),
     Mutation("Refit(-least - 0.5 * volume, square)", "Refit(-least, square)", "test_assess.py"),
     Mutation("np.where(held, PINNED, 0.0)", "np.where(held, 0.0, 0.0)", "test_assess.py"),

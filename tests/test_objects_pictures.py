@@ -23,6 +23,7 @@ from probcal.gaussian.mode import Point
 from probcal.geometry import bearing, norm
 from probcal.plots import interactive, scene
 from probcal.report import tables, write_report
+from probcal.results.read import bias_values
 from probcal.results.views import view_variables
 
 EXISTENCE = {"track_0": [0.3, 0.8, 1.0, 0.9], "track_1": [0.1, 0.95, 0.4]}
@@ -74,7 +75,7 @@ def test_the_scene_has_objects_and_views_of_calibrated_sensors():
     around, sector, other = shown.views
     assert [own.sensor for own in shown.views] == ["a", "b", "c"]
     np.testing.assert_allclose(np.hypot(*around.lines[0].T), 30.0)
-    moved = scene.shifts(tree())
+    moved = bias_values(tree())
     corner = np.array([50.0 + moved["b.position_x"], moved["b.position_y"]])
     np.testing.assert_allclose(sector.lines[0][[0, -1]], [corner, corner])
     line = sector.lines[0][1:-1] - corner

@@ -44,6 +44,7 @@ def calibration(labels, scale, status):
         "status": status,
         "unit": np.full(count, "m"),
         "kind": np.full(count, "scale"),
+        "owner": [str(label).rpartition(".")[0] for label in labels],
     }
     return xr.Dataset(
         {name: ("bias_label", value) for name, value in columns.items()}
@@ -72,7 +73,12 @@ def residuals(count=300):
     before, after = rng.normal(2.0, 3.0, count), rng.normal(size=count)
     before[0] = 1e3
     return xr.Dataset(
-        {"before": ("datum", before), "after": ("datum", after), "std": ("datum", np.ones(count))},
+        {
+            "before": ("datum", before),
+            "after": ("datum", after),
+            "std": ("datum", np.ones(count)),
+            "weight": ("datum", np.ones(count)),
+        },
         coords={"channel": ("datum", np.where(np.arange(count) % 3 == 0, "azimuth", "range"))},
     )
 
@@ -94,8 +100,17 @@ def make(dimension=2, nodes=("north", "south"), status="converged", recursions=1
         "residual": residuals(),
         "optimisation": xr.Dataset({"objective": ("iteration", [-300.0, -250.0, -249.0])}),
         "constant_data": xr.Dataset(
-            {"node_position": (("node", "axis"), position), "moving": ("node", np.zeros(len(nodes), bool))},
-            coords={"node": list(nodes), "axis": list(AXES[:dimension])},
+            {
+                "node_position": (("node", "axis"), position),
+                "node_heading": ("node", np.zeros(len(nodes))),
+                "moving": ("node", np.zeros(len(nodes), bool)),
+            },
+            coords={
+                "node": list(nodes),
+                "axis": list(AXES[:dimension]),
+                "placed_sensor": ("placement", [f"radar_{node}" for node in nodes]),
+                "placed_node": ("placement", list(nodes)),
+            },
         ),
     }
     tree = xr.DataTree.from_dict(groups)
@@ -398,9 +413,8 @@ def test_map_ellipse_leans_with_the_correlation():
     assert long % 180 == pytest.approx(45)
 
 
-def test_map_draws_headings_only_where_the_stated_ones_are_known():
+def test_map_draws_calibrated_headings():
     tree = make()
-    assert not plots.plot_map(tree).collections
     nodes = tree["constant_data"].to_dataset().assign(node_heading=("node", [np.pi / 2, 0.0]))
     tree["constant_data"] = xr.DataTree(nodes)
     (arrows,) = plots.plot_map(tree).collections

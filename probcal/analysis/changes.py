@@ -14,13 +14,14 @@ import xarray as xr
 
 from probcal.analysis import pieces
 from probcal.analysis.compare import common_labels
-from probcal.analysis.findings import Finding
+from probcal.analysis.findings import Finding, finding_group
 from probcal.analysis.verdict import RATE, limit_of
 from probcal.errors import InputError, checked
-from probcal.labels import check_name, listed, step_of
+from probcal.labels import check_name, label_parts, listed, step_of
 from probcal.linalg import marginalise
 from probcal.results.answer import HALF
-from probcal.results.schema import INTERVAL, matrix_of
+from probcal.results.read import stated_values
+from probcal.results.schema import INTERVAL, held_biases, matrix_of
 from probcal.status import Status
 
 PATTERN = np.array([[0.0], [1.0]])  # what the second recording has beyond the first
@@ -90,7 +91,7 @@ def changes(first: xr.DataTree, second: xr.DataTree, *, names: Sequence[str] = (
     tree = xr.DataTree.from_dict(
         {
             "change": found,
-            "finding": xr.Dataset({name: ("finding", [getattr(f, name) for f in told]) for name in Finding._fields}),
+            "finding": finding_group(told),
         }
     )
     tree.attrs |= {"first": str(names[0]), "second": str(names[1]), "interval_probability": INTERVAL}
@@ -115,7 +116,7 @@ def _check(name: str, tree: xr.DataTree) -> None:
 
 def _check_zero(pair: dict[str, xr.DataTree]) -> None:
     """Raise `InputError` where the fits count a bias from other stated values, or hold one that the other does not."""
-    (one, first), (two, second) = ((name, tree["constant_data"].to_dataset()) for name, tree in pair.items())
+    (one, first), (two, second) = pair.items()
     if len({str(tree.attrs.get("network", "")) for tree in pair.values()}) > 1:
         raise InputError(f'changes: "{one}" and "{two}" started from different networks; give both one --network')
     stated = [_stated(first), _stated(second)]
@@ -124,10 +125,7 @@ def _check_zero(pair: dict[str, xr.DataTree]) -> None:
         if not np.isclose(a, b, rtol=1e-9, atol=1e-12):
             values = f'{a:.10g} in "{one}" and {b:.10g} in "{two}"'
             raise InputError(f"changes: {what} is stated as {values}; state the same values in both")
-    held = [
-        {str(label): float(value) for label, value in own["fixed"].to_series().items()} if "fixed" in own else {}
-        for own in (first, second)
-    ]
+    held = [held_biases(tree) for tree in (first, second)]
     free = [set(tree["calibration"].to_dataset()["bias_label"].values.tolist()) for tree in pair.values()]
     for k, name in enumerate(pair):
         for label, value in held[k].items():
@@ -135,16 +133,11 @@ def _check_zero(pair: dict[str, xr.DataTree]) -> None:
                 raise InputError(f'changes: {label} is fixed at {value:g} in "{name}" only; fix the same in both')
 
 
-def _stated(group: xr.Dataset) -> dict[str, float]:
+def _stated(tree: xr.DataTree) -> dict[str, float]:
     """Stated values of the nodes that rest, by node and component."""
-    moving = dict(zip(group["node"].values.tolist(), group["moving"].values.tolist(), strict=True))
-    names = zip(group["stated_node"].values.tolist(), group["stated_component"].values.tolist(), strict=True)
-    found = {f"{n}.{c}": float(v) for (n, c), v in zip(names, group["stated"].values, strict=True) if not moving[n]}
-    for name, place in zip(group["node"].values.tolist(), group["node_position"].values, strict=True):
-        if not moving[name]:
-            axes = zip(group["axis"].values.tolist(), place.tolist(), strict=True)
-            found |= {f"{name}.position_{axis}": value for axis, value in axes}
-    return found
+    moving = tree["constant_data"].to_dataset()["moving"].to_series()
+    values = stated_values(tree)
+    return {label: value for label, value in values.items() if not moving[label_parts(label)[0]]}
 
 
 def _still(tree: xr.DataTree, label: str) -> bool:

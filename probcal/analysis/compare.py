@@ -10,11 +10,13 @@ import xarray as xr
 from probcal.analysis import loo
 from probcal.analysis.choices import check_count, check_names, split_pair
 from probcal.analysis.differences import findings
-from probcal.analysis.findings import Finding
+from probcal.analysis.findings import Finding, finding_group
 from probcal.analysis.overlap import Marginal, of_draws, of_gaussian, overlap, wasserstein
 from probcal.errors import InputError, checked, nearest
 from probcal.labels import label_parts
+from probcal.results.read import known_truth
 from probcal.results.schema import EVIDENCES
+from probcal.results.scores import judged_by, rms
 from probcal.status import INVALID
 
 Fits = Mapping[str, xr.DataTree] | Sequence[xr.DataTree]
@@ -70,8 +72,7 @@ def compare(fits: Fits, names: Sequence[str] | None = None) -> xr.DataTree:
         "interval_probability": float(next(iter(known.values())).attrs["interval_probability"]),
     }
     said = [*_left_out(known, labels), *findings(tree)]
-    columns = {name: ("finding", [getattr(one, name) for one in said]) for name in Finding._fields}
-    tree["finding"] = xr.DataTree(xr.Dataset(columns))
+    tree["finding"] = xr.DataTree(finding_group(said))
     return tree
 
 
@@ -192,15 +193,13 @@ def _pairs(fits: Mapping[str, xr.DataTree], labels: list[str]) -> xr.Dataset:
     columns: dict[str, Any] = {
         measure.__name__: (
             ("pair", "bias_label"),
-            [
-                [measure(a, b) for a, b in zip(marginals[first], marginals[second], strict=True)]
-                for first, second in pairs
-            ],
+            [[measure(*own) for own in zip(marginals[a], marginals[b], strict=True)] for a, b in pairs],
         )
         for measure in (overlap, wasserstein)
     }
-    coords = {name: ("pair", [pair[k] for pair in pairs]) for k, name in enumerate(("first", "second"))}
-    return xr.Dataset(columns, {**coords, "bias_label": labels})
+    first, second = zip(*pairs, strict=True)
+    ends = {"first": ("pair", list(first)), "second": ("pair", list(second))}
+    return xr.Dataset(columns, {**ends, "bias_label": labels})
 
 
 def _method(tree: xr.DataTree, labels: list[str]) -> xr.Dataset:
@@ -237,10 +236,8 @@ def _truth(fits: Mapping[str, xr.DataTree], labels: list[str]) -> dict[str, floa
     """True biases that any of the fits knows."""
     found: dict[str, float] = {}
     for name, tree in fits.items():
-        if "truth" not in tree.children:
-            continue
-        for label, value in tree["truth"].to_dataset()["bias"].to_series().items():
-            if found.setdefault(str(label), float(value)) != float(value):
+        for label, value in known_truth(tree).items():
+            if found.setdefault(str(label), value) != value:
                 raise InputError(
                     f'compare: the true {label} of "{name}" is not that of the fits before it; score them alike'
                 )
@@ -251,14 +248,12 @@ def _scores(tree: xr.DataTree, truth: Mapping[str, float]) -> dict[str, Any]:
     """Error in scales, and how many intervals hold the truth: of all known biases and of those that are not zero."""
     if not truth:
         return {}
-    group, true = tree["calibration"].to_dataset().sel(bias_label=list(truth)), np.array(list(truth.values()))
-    error = (group["mean"].values - true) / group["scale"].values
-    inside = (group["lower"].values <= true) & (true <= group["upper"].values)
-    found: dict[str, Any] = {"bias_rmse": float(np.sqrt(np.mean(error**2)))}
-    for suffix, mine in (("", np.ones(len(true), bool)), ("_nonzero", true != 0)):
-        if mine.any():
-            count = {f"covered{suffix}": int(inside[mine].sum()), f"known{suffix}": int(mine.sum())}
-            found |= count | {f"coverage{suffix}": float(inside[mine].mean())}
+    known = judged_by(tree, truth)
+    found: dict[str, Any] = {"bias_rmse": rms(known["error"])}
+    for suffix, own in (("", known["inside"]), ("_nonzero", known["inside"][known["true"] != 0])):
+        if len(own):
+            count = {f"covered{suffix}": int(own.sum()), f"known{suffix}": len(own)}
+            found |= count | {f"coverage{suffix}": float(own.mean())}
     return found
 
 

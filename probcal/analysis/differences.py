@@ -5,7 +5,7 @@ its interval holds the mean of the reference and its sd is within a factor of `N
 as much of the reference as an interval holds lies within `overlap.ZERO` scales of zero.
 """
 
-from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -53,56 +53,63 @@ def _doubts(name: str, method: xr.Dataset) -> list[Finding]:
 
 def _against(comparison: xr.DataTree, name: str, reference: str) -> list[Finding]:
     """What the reference says of one method."""
-    estimate = comparison["estimate"].to_dataset()
-    one, other = (estimate.sel(estimator=n) for n in (name, reference))
-    labels, level = estimate["bias_label"].values.astype(str), float(comparison.attrs["interval_probability"])
-    scale, unit = estimate["scale"].values, [f" {u}" if u != "1" else "" for u in estimate["unit"].values]
-    mean, sd = (other[column].values for column in ("mean", "sd"))
-    own, theirs = (estimated["status"].values == "pruned" for estimated in (one, other))
-    pruned, known = own | theirs, sd > 0
-    missed = ~pruned & ((mean < one["lower"].values) | (mean > one["upper"].values))
-    ratio = np.where(known, one["sd"].values / np.where(known, sd, 1.0), 1.0)
-    narrow, wide = ~pruned & (ratio < NARROW), ~pruned & (ratio > 1 / NARROW)
-    away = np.abs(one["mean"].values - mean) / scale
-    total, found = len(labels), list[Finding]()
-
-    def tell(kind: str, mask: np.ndarray, size: np.ndarray, text: str, of: Callable[[int], str]) -> None:
-        """One sentence on the biases in a mask, {} their number, those of the largest size named."""
-        order = np.flatnonzero(mask)[np.argsort(-size[mask], kind="stable")]
-        if len(order):
-            said = f"{name}: {text.replace('{}', str(len(order)), 1)}"
-            named = listed([f"{labels[k]} ({of(k)})" for k in order], NAMES)
-            found.append(Finding(kind, labels[order[0]], f"{said}: {named}"))
-
-    pair = comparison["pair"].to_dataset()
-    mine = [{a, b} == {name, reference} for a, b in zip(pair["first"].values, pair["second"].values, strict=True)]
-    there = pair["overlap"].values[np.flatnonzero(mine)[0]]  # of a pruned bias: how much of the reference is near zero
-    lost = pruned & (there < level)
-    enough = ~(lost | missed | narrow | wide)
-    sampled = comparison[f"method/{reference}"].attrs["posterior"] == "draws"
-    verb = "is enough for" if sampled else f"agrees with {reference} on"
-    text = f"{verb} {enough.sum()} of {total} biases"
+    level, other = float(comparison.attrs["interval_probability"]), comparison[f"method/{reference}"].to_dataset()
+    frame = _by_bias(comparison, name, reference)
+    total, found = len(frame), list[Finding]()
+    pruned = frame["pruned"] | frame["pruned_there"]
+    lost = pruned & (frame["overlap"] < level)
+    missed = ~pruned & ~frame["mean_there"].between(frame["lower"], frame["upper"])
+    narrow, wide = ~pruned & (frame["ratio"] < NARROW), ~pruned & (frame["ratio"] > 1 / NARROW)
+    enough = (~(lost | missed | narrow | wide)).sum()
+    verb = "is enough for" if other.attrs["posterior"] == "draws" else f"agrees with {reference} on"
+    text = f"{name} {verb} {enough} of {total} biases"
     text += f": its interval holds the mean of {reference}, its sd is within {NARROW:g} to {1 / NARROW:.2f} times that"
     if pruned.any():
         text += f"; of those pruned {level:.0%} of the other posterior lies within {ZERO:g} scales of zero"
-    found.append(Finding("enough", name, f"{name} {text}"))
-    tell("interval", missed, away, f"the {level:.0%} intervals of {{}} of {total} miss the mean of {reference}",
-         lambda k: f"{one['mean'].values[k]:.3g} against {mean[k]:.3g}{unit[k]}")  # fmt: skip
-    tell("narrow", narrow, -ratio, f"the sd of {{}} of {total} is below {NARROW:g} times that of {reference}",
-         lambda k: f"{ratio[k]:.2g} times")  # fmt: skip
-    tell("wide", wide, ratio, f"the sd of {{}} of {total} is above {1 / NARROW:.2f} times that of {reference}",
-         lambda k: f"{ratio[k]:.2g} times")  # fmt: skip
-    text = f"{{}} of the {own.sum()} that it pruned are not zero to {reference}, which leaves them"
-    tell("pruned", lost & own, -there, text, lambda k: f"{there[k]:.0%} near zero, sd {sd[k] / scale[k]:.2g} scales")
-    wider = one["sd"].values / scale
-    text = f"{{}} of the {theirs.sum()} that {reference} pruned are not zero to it, which leaves them"
-    tell("pruned", lost & theirs & ~own, -there, text, lambda k: f"{there[k]:.0%} near zero, sd {wider[k]:.2g} scales")
-    method = comparison[f"method/{reference}"].to_dataset()
-    if "gamma_upper" in method:
-        upper, gamma = method["gamma_upper"].values, one["gamma"].values
+    found.append(Finding("enough", name, text))
+
+    def tell(kind: str, chosen: Any, size: Any, text: str, form: str) -> None:
+        """Add a sentence on the chosen biases, {} their number, those of largest size named, each with its numbers."""
+        own = frame[chosen].loc[size[chosen].sort_values(ascending=False, kind="stable").index]
+        if len(own):
+            named = [f"{label} ({form.format_map(row)})" for label, row in own.to_dict("index").items()]
+            text = text.replace("{}", str(len(own)), 1)
+            found.append(Finding(kind, own.index[0], f"{name}: {text}: {listed(named, NAMES)}"))
+
+    text = f"the {level:.0%} intervals of {{}} of {total} miss the mean of {reference}"
+    tell("interval", missed, frame["away"], text, "{mean:.3g} against {mean_there:.3g}{unit}")
+    times = f"times that of {reference}"
+    text = f"the sd of {{}} of {total} is below {NARROW:g} {times}"
+    tell("narrow", narrow, -frame["ratio"], text, "{ratio:.2g} times")
+    text = f"the sd of {{}} of {total} is above {1 / NARROW:.2f} {times}"
+    tell("wide", wide, frame["ratio"], text, "{ratio:.2g} times")
+    text = f"{{}} of the {frame['pruned'].sum()} that it pruned are not zero to {reference}, which leaves them"
+    form = "{overlap:.0%} near zero, sd {wide_there:.2g} scales"
+    tell("pruned", lost & frame["pruned"], -frame["overlap"], text, form)
+    text = f"{{}} of the {frame['pruned_there'].sum()} that {reference} pruned are not zero to it, which leaves them"
+    form = "{overlap:.0%} near zero, sd {wide:.2g} scales"
+    tell("pruned", lost & ~frame["pruned"], -frame["overlap"], text, form)
+    if "gamma_upper" in other:
+        frame["gamma_upper"] = other["gamma_upper"].to_series()
+        above = frame["gamma"] - frame["gamma_upper"]
         text = f"gamma of {{}} of {total} lies above the {level:.0%} interval of that of {reference}"
-        tell("gamma", gamma > upper + GAMMA, gamma - upper, text, lambda k: f"{gamma[k]:.2f} above {upper[k]:.2f}")
+        tell("gamma", above > GAMMA, above, text, "{gamma:.2f} above {gamma_upper:.2f}")
     return found
+
+
+def _by_bias(comparison: xr.DataTree, name: str, reference: str) -> Any:
+    """One row a bias: what a method says of it, what the reference does (`_there`), and how they differ."""
+    group, pair = comparison["estimate"].to_dataset(), comparison["pair"].to_dataset()
+    one, other = (group.sel(estimator=own).to_dataframe() for own in (name, reference))
+    frame = one.join(other[["mean", "sd"]].add_suffix("_there"))
+    frame["pruned"], frame["pruned_there"] = one["status"] == "pruned", other["status"] == "pruned"
+    frame["ratio"] = (one["sd"] / other["sd"]).where(other["sd"] > 0, 1.0)
+    frame["away"] = (one["mean"] - other["mean"]).abs() / one["scale"]
+    frame["wide"], frame["wide_there"] = one["sd"] / one["scale"], other["sd"] / one["scale"]
+    frame["unit"] = [f" {unit}" if unit != "1" else "" for unit in one["unit"]]
+    both = [{a, b} == {name, reference} for a, b in zip(pair["first"].values, pair["second"].values, strict=True)]
+    frame["overlap"] = pair["overlap"].values[both.index(True)]  # of a pruned bias: how much is near zero
+    return frame
 
 
 def _coverage(comparison: xr.DataTree, methods: dict[str, xr.Dataset]) -> list[Finding]:

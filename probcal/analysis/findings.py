@@ -58,6 +58,12 @@ def in_order(findings: list[Finding]) -> list[Finding]:
     return sorted(findings, key=place)
 
 
+def finding_group(findings: Sequence[Finding]) -> xr.Dataset:
+    """Findings as a group of a tree."""
+    columns = {name: [getattr(one, name) for one in findings] for name in Finding._fields}
+    return xr.Dataset({name: ("finding", np.array(values, str)) for name, values in columns.items()})
+
+
 def completed(
     result: xr.DataTree,
     text: str,
@@ -67,8 +73,7 @@ def completed(
     """A widened result with its assessment; `text` says why the innovations reject the model."""
     said(result, sentence(text))
     findings = in_order(findings + [Finding("widened", "fit", text)] * bool(text))
-    texts = {name: ("finding", np.array([getattr(f, name) for f in findings], str)) for name in Finding._fields}
-    for name, group in (groups | {"finding": xr.Dataset(texts)}).items():
+    for name, group in (groups | {"finding": finding_group(findings)}).items():
         result[name] = xr.DataTree(group)
     result.attrs["assessed"] = 1
     return result

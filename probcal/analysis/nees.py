@@ -9,7 +9,7 @@ from scipy import special
 
 from probcal import linalg
 from probcal.inference.fitted import Judged
-from probcal.labels import AXES
+from probcal.labels import coordinates
 from probcal.linalg import eigenvalues, spectrum
 from probcal.results.schema import matrix_of
 from probcal.simulate import Truth
@@ -33,7 +33,7 @@ def of_positions(target: str, track: xr.Dataset, states: np.ndarray, truth: Trut
     Errors of neighbouring epochs are alike: the limits of the mean are those of the posterior's own draws.
     """
     names, times = track["component"].values.tolist(), track["time"].values
-    axes = [f"position_{axis}" for axis in AXES if f"position_{axis}" in names]
+    axes = coordinates(names)
     if truth.tracks is None:
         return None
     true = truth.positions(times, np.full(len(times), target), len(axes))

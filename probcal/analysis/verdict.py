@@ -27,6 +27,7 @@ whose data fit the rest badly, is a finding of its own: it widens those standard
 """
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -97,7 +98,7 @@ def judge_biases(
     disagreements: Mapping[int, str],
     first: str,
     shared: Mapping[int, str],
-    doubts: Mapping[int, str] | None = None,
+    doubts: Mapping[int, str] = MappingProxyType({}),
 ) -> tuple[list[str], list[str]]:
     """Verdict and reason of every bias, from the evidence and the reasons of those that change, `first` most.
 
@@ -112,33 +113,24 @@ def judge_biases(
         sizes = f"{declared} of {_size(bias.scale, unit)} to {_size(bias.scale * np.sqrt(1 - s), unit)}"
         information = f"information {s / max(1 - s, 1e-12):.2g}"
         beyond = f"{known.pull[m]:.1f} sd beyond its {declared} of {_size(bias.scale, unit)} (limit {known.limit:.1f})"
-        if status is Status.MISFIT:
-            verdict, reason = "conflicting", "the fit ended misfit: model and data contradict each other"
-        elif m in drifts:
-            verdict, reason = "drifting", drifts[m]
-        elif known.pull[m] > known.limit and explained[m] >= PART:
-            verdict, reason = "conflicting", beyond
-        elif m in disagreements:
-            verdict, reason = "conflicting", disagreements[m]
-        elif s < PRIOR_ONLY:
-            verdict, reason = "prior only", f"the data hardly narrow its {declared} ({information})"
-        elif s < WEAK:
-            verdict, reason = "weak", f"the data narrow its {sizes} only ({information})"
-        elif known.pull[m] > known.limit:
-            verdict = "weak"
-            reason = f"{beyond}, by a misfit elsewhere: it explains {explained[m]:.1g} of the excess of the innovations"
-        elif doubts and m in doubts:
-            verdict, reason = "weak", doubts[m]
-        elif m in shared:
-            verdict, reason = "weak", f"it belongs to {shared[m]}, which the data leave open"
-        elif not status.settled:
-            verdict, reason = "weak", f"the fit ended {status}, which is no answer"
-        elif ended[m] == "not mixed":
-            verdict, reason = "weak", "its chains have not mixed, which is no answer"
-        elif ended[m] == "pruned":
-            verdict, reason = "weak", "pruned: its precision was maximised, and its interval is none"
-        else:
-            verdict, reason = "determined", f"the data narrow its {sizes}"
+        far, part = known.pull[m] > known.limit, explained[m]
+        elsewhere = f"{beyond}, by a misfit elsewhere: it explains {part:.1g} of the excess of the innovations"
+        cases = (  # the first that holds counts
+            (status is Status.MISFIT, "conflicting", "the fit ended misfit: model and data contradict each other"),
+            (m in drifts, "drifting", drifts.get(m, "")),
+            (far and part >= PART, "conflicting", beyond),
+            (m in disagreements, "conflicting", disagreements.get(m, "")),
+            (s < PRIOR_ONLY, "prior only", f"the data hardly narrow its {declared} ({information})"),
+            (s < WEAK, "weak", f"the data narrow its {sizes} only ({information})"),
+            (far, "weak", elsewhere),
+            (m in doubts, "weak", doubts.get(m, "")),
+            (m in shared, "weak", f"it belongs to {shared.get(m)}, which the data leave open"),
+            (not status.settled, "weak", f"the fit ended {status}, which is no answer"),
+            (ended[m] == "not mixed", "weak", "its chains have not mixed, which is no answer"),
+            (ended[m] == "pruned", "weak", "pruned: its precision was maximised, and its interval is none"),
+            (True, "determined", f"the data narrow its {sizes}"),
+        )
+        verdict, reason = next((verdict, reason) for holds, verdict, reason in cases if holds)
         if verdict != "drifting" and known.square[m] > known.limit**2 and first not in ("", bias.label):
             reason += f"; its halves differ by {np.sqrt(known.square[m]):.1f} sd, which {first} explains"
         verdicts.append(verdict)

@@ -1,6 +1,7 @@
 """`check`: what the data can and cannot determine, by name, what to do, and what to measure next."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +9,10 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from probcal import plots
 from probcal.analysis import bound_map, next_anchors, next_passes, next_sensors, observability
 from probcal.analysis.standpoint import standpoint
-from probcal.cli.files import can_plot, say_written, write_csv
+from probcal.cli.files import formatted, write_result
 from probcal.cli.models import load_problem, on_network
 from probcal.cli.progress import shown
 from probcal.errors import InputError
@@ -19,12 +21,13 @@ from probcal.gaussian.choose import choose
 from probcal.gaussian.mode import Point
 from probcal.inference.progress import Monitor
 from probcal.labels import NOBODY
-from probcal.modes import automatic_start
 from probcal.problem import Problem
-from probcal.results.io import save
+from probcal.results.read import frame_of
 
+Plans = tuple[xr.Dataset | None, xr.Dataset, xr.Dataset]
 MANY, SHOWN, LISTED = 400, 40, 12  # biases up to which all are printed, of more so many; directions of many
 MAP_CELLS = 60  # of a bound map an axis
+COLUMNS = ("unit", "scale", "kind", "sd", "share", "verdict")
 STATUS = {
     "determined": "status: determined",
     "weak": "status: weak: some directions are left to prior and survey by half or more",
@@ -38,57 +41,38 @@ def run(
 ) -> int:  # fmt: skip
     """Check before a fit: what the data can and cannot determine, by name, what to do, and what to measure next."""
     problem = on_network(load_problem(model, data, fix, given)[1], network)
-    if not choose(problem.model).cheap:
-        return _check_many(problem, model, outputs)
-    with shown() as progress:
-        monitor = Monitor(progress)
-        monitor.enter("start", "check")
-        start = automatic_start(problem)
-        monitor.enter("determined directions")
-        tree = observability(problem, point=start)
-        monitor.enter("next measurements")
-        plans = _planned(problem, start)
-    tree.attrs["model"] = model.stem
-    print_known(problem, tree)
-    _print_plans(plans)
-    print(STATUS[tree.attrs["status"]])
-    if outputs is not None:
-        with outputs.writing():
-            _write(problem, tree, plans[0], outputs.folder)
-    return 1 if tree.attrs["status"] == "open" else 0
-
-
-def _check_many(problem: Problem, model: Path, outputs: Outputs | None) -> int:
-    """The check of a network too large for matrices of all biases: tables, and no pictures of bounds."""
     with shown() as progress:
         monitor = Monitor(progress)
         monitor.enter("start", "check")
         start = standpoint(problem, None, None)
         monitor.enter("determined directions")
         tree = observability(problem, point=start)
+        monitor.enter("next measurements")
+        try:
+            plans: Plans | None = _planned(problem, start)
+        except InputError as error:
+            plans, reason = None, error
     tree.attrs["model"] = model.stem
     print_known(problem, tree)
-    try:
-        with shown() as progress:
-            Monitor(progress).enter("next measurements", "check")
-            plans = _planned(problem, start)
+    if plans is None:
+        print(f"What to measure next is not said: {reason}")
+    else:
         _print_plans(plans)
-    except InputError as error:
-        print(f"What to measure next is not said: {error}")
     print(STATUS[tree.attrs["status"]])
     if outputs is not None:
-        with outputs.writing():
-            say_written(_write_tables(tree, outputs.folder))
+        passes = plans[0] if plans is not None and choose(problem.model).cheap else None
+        draw = None if passes is None else partial(_draw, problem, tree, passes)
+        write_result(outputs, tree, _biases(tree), draw)
     return 1 if tree.attrs["status"] == "open" else 0
 
 
-def _planned(problem: Problem, start: Point) -> tuple[xr.Dataset | None, xr.Dataset, xr.Dataset]:
+def _planned(problem: Problem, start: Point) -> Plans:
     """Plans of another pass, a survey and a further sensor; no pass where no row has a target."""
     passes = next_passes(problem, point=start) if problem.targets else None
     return passes, next_anchors(problem, point=start), next_sensors(problem, point=start)
 
 
-def _print_plans(plans: tuple[xr.Dataset | None, xr.Dataset, xr.Dataset]) -> None:
+def _print_plans(plans: Plans) -> None:
     """What to measure next; of many biases without how many directions would be left."""
     passes, anchors, sensors_ = plans
     counted = "weak" in anchors
@@ -132,9 +116,9 @@ def print_known(problem: Problem, tree: xr.DataTree) -> None:
     if len(table) < tree["bias"].sizes["bias_label"]:
         print(f"{len(table)} of {tree['bias'].sizes['bias_label']} biases, those that the data tell least of")
     print("share: how much of the answer the data give under a prior of one scale; sd: the bound that goes with it")
-    sensors = tree["sensor"].to_dataset().to_dataframe().sort_values("leverage")
-    print("biases that the rows of each sensor determine: " + _listed(sensors["leverage"]))
-    targets = tree["target"].to_dataset()["leverage"].to_series().sort_values().drop(NOBODY, errors="ignore")
+    sensors, targets = (frame_of(tree, group, "leverage")["leverage"].sort_values() for group in ("sensor", "target"))
+    print(f"biases that the rows of each sensor determine: {_listed(sensors)}")
+    targets = targets.drop(NOBODY, errors="ignore")
     listed = f"of each target: {_listed(targets)}; of" if len(targets) else "of"
     print(f"{listed} the motion: {tree['target'].attrs['motion']:.2f}")
     print(_directions_text(tree))
@@ -145,16 +129,16 @@ def _directions_text(tree: xr.DataTree) -> str:
     if "direction" not in tree.children:
         surveyed = "survey" in tree["bias"].to_dataset()["kind"].values.tolist()
         return f"the data determine every direction of the biases{' without a survey' if surveyed else ''}"
-    group = tree["direction"].to_dataset()
-    count = max(group.sizes["direction"], int(tree.attrs["weak"]))
+    frame = frame_of(tree, "direction", "kind", "share", "words", "remedy")
+    count = max(len(frame), int(tree.attrs["weak"]))
     plural = "s" * (count > 1)
     lines = [f"{count} direction{plural} of the biases that the data hardly determine; remedies add up (--fix LABEL):"]
-    if count > group.sizes["direction"]:
+    if count > len(frame):
         lines = [f"{count} directions of the biases that the data hardly determine, {LISTED} of them:"]
-    for k in range(min(group.sizes["direction"], LISTED if count > group.sizes["direction"] else count)):
-        kind, share, words = (group[name].values[k] for name in ("kind", "share", "words"))
-        lines.append(f"  {k + 1}. {group['direction'].values[k]} ({kind}, the data give {share:.2g} of the answer)")
-        lines += [f"     {words}", f"     {group['remedy'].values[k]}"]
+    shown = frame[:LISTED] if count > len(frame) else frame
+    for k, (name, kind, share, words, remedy) in enumerate(shown.itertuples(name=None), 1):
+        lines.append(f"  {k}. {name} ({kind}, the data give {share:.2g} of the answer)")
+        lines += [f"     {words}", f"     {remedy}"]
     return "\n".join([*lines, tree.attrs["rule"]])
 
 
@@ -164,33 +148,20 @@ def _listed(values: pd.Series, most: int = 8) -> str:
     return ", ".join(pairs if len(pairs) <= most else [*pairs[: most // 2], "...", *pairs[-most // 2 :]])
 
 
-def check_table(tree: xr.DataTree) -> pd.DataFrame:
+def _biases(tree: xr.DataTree) -> pd.DataFrame:
     """The biases of a check: bias, unit, scale (or survey), kind, sd (bound), share, verdict."""
-    columns = ["unit", "scale", "kind", "sd", "share", "verdict"]
-    frame = tree["bias"].to_dataset()[columns].to_dataframe().reset_index()
-    frame = frame[["bias_label", *columns]].rename(columns={"bias_label": "bias"})
-    shown = {"scale": "{:.4g}", "sd": "{:.4g}", "share": "{:.3f}"}
-    return frame.assign(**{name: [form.format(v) for v in frame[name]] for name, form in shown.items()})
+    return frame_of(tree, "bias", *COLUMNS).rename_axis("bias").reset_index()
 
 
-def _write_tables(tree: xr.DataTree, out: Path) -> list[Path]:
-    files = [out / "check.nc", out / "check.csv"]
-    save(tree, files[0])
-    columns = ["unit", "scale", "kind", "sd", "share", "verdict"]
-    frame = tree["bias"].to_dataset()[columns].to_dataframe().reset_index().rename(columns={"bias_label": "bias"})
-    write_csv(frame[["bias", *columns]], files[1])
-    return files
+def check_table(tree: xr.DataTree) -> pd.DataFrame:
+    """The same with its numbers as texts."""
+    return formatted(_biases(tree), {"scale": "{:.4g}", "sd": "{:.4g}", "share": "{:.3f}"})
 
 
-def _write(problem: Problem, tree: xr.DataTree, passes: xr.Dataset | None, out: Path) -> None:
-    files = _write_tables(tree, out)
-    if passes is not None and can_plot():
-        from probcal.plots import draw_check  # the plot packages are an extra
-
-        files.append(out / "check.png")
-        low, high = passes["path"].values.min((0, 1)), passes["path"].values.max((0, 1))
-        height = float((low + high)[2] / 2) if len(low) == 3 else None
-        sides = [(a, b) for a, b in zip(low[:2], high[:2], strict=True)]
-        bound = bound_map(problem, sides, cells=MAP_CELLS, biases="unknown", z=height)
-        draw_check(tree, passes, bound, files[-1])
-    say_written(files)
+def _draw(problem: Problem, tree: xr.DataTree, passes: xr.Dataset, path: Path) -> None:
+    """Write the pictures of a check."""
+    low, high = passes["path"].values.min((0, 1)), passes["path"].values.max((0, 1))
+    height = float((low + high)[2] / 2) if len(low) == 3 else None
+    sides = list(zip(low[:2].tolist(), high[:2].tolist(), strict=True))
+    bound = bound_map(problem, sides, cells=MAP_CELLS, biases="unknown", z=height)
+    plots.draw_check(tree, passes, bound, path)

@@ -1,11 +1,11 @@
 """What the commands write: tables in one step, the report."""
 
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probcal.files import write_whole
+from probcal.files import Outputs, write_whole
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,6 +29,39 @@ def report_of(tree: "xr.DataTree", out: Path, *, static: bool = False) -> Path:
     from probcal.report import write_report  # the plot packages are an extra
 
     return write_report(tree, out / "report.html", static=static)
+
+
+def formatted(frame: "pd.DataFrame", forms: Mapping[str, str]) -> "pd.DataFrame":
+    """A table with the numbers of some columns as texts, those that it has."""
+    texts = {name: frame[name].map(form.format) for name, form in forms.items() if name in frame}
+    return frame.assign(**texts)
+
+
+def write_result(
+    outputs: Outputs, tree: "xr.DataTree", frame: "pd.DataFrame", draw: Callable[[Path], None] | None, run: str = ""
+) -> None:
+    """Write the NAME.nc, NAME.csv and, where it can be drawn, NAME.png of a result, and print what was written."""
+    from probcal.results.io import save  # it loads xarray
+
+    result, table, picture = (outputs.folder / name for name in outputs.names)
+    files = [result, table]
+    with outputs.writing(run):
+        save(tree, result)
+        write_csv(frame, table)
+        if draw is not None and can_plot():
+            draw(picture)
+            files.append(picture)
+        say_written(files)
+
+
+def say_findings(tree: "xr.DataTree", most: int | None = None, where: str = "") -> None:
+    """Print the sentences of a result, all or the first, and where the others are; nothing where it has none."""
+    if "finding" in tree.children:
+        sentences = tree["finding"].to_dataset()["sentence"].values.tolist()
+        shown = sentences[:most]
+        left = len(sentences) - len(shown)
+        for sentence in [*shown, *([f"and {left} more {where}"] if left else [])]:
+            print(f"- {sentence}")
 
 
 def say_written(files: Sequence[Path]) -> None:

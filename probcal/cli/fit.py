@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from probcal.cli.files import can_plot, report_of, say_written, write_csv
+from probcal.cli.files import can_plot, formatted, report_of, say_findings, say_written, write_csv
 from probcal.cli.models import load_problem, load_truth, note_network, on_network, prior_named
 from probcal.cli.progress import shown
 from probcal.errors import InputError
@@ -35,6 +35,11 @@ from probcal.status import INVALID, Status
 
 FINDINGS = 8  # sentences of an assessment that are printed
 MANY, SHOWN = 400, 40  # biases up to which all are printed, and of more so many
+FORMS = {  # of the columns of numbers in the table of biases
+    **dict.fromkeys(("scale", "mean", "sd", "lower", "upper"), "{:.4g}"),
+    **dict.fromkeys(("gamma", "inclusion", "r_hat"), "{:.3f}"),
+    "ess": "{:.0f}",
+}
 ENDING = (signal.SIGINT, signal.SIGTERM)  # signals that end a fit with the best answer so far
 LONG = 60.0  # s of a fit that is written before it is assessed
 
@@ -164,16 +169,9 @@ def table_text(tree: xr.DataTree) -> str:
     whole = len(frame)
     if whole > MANY:
         sure = (frame["mean"] / frame["sd"]).abs().to_numpy()
-        frame = frame.iloc[sorted(np.argsort(-sure, kind="stable")[:SHOWN])].copy()
-    numbers = ["scale", "mean", "sd", "lower", "upper"]
-    for name in numbers:
-        frame[name] = [f"{value:.4g}" for value in frame[name]]
-    frame["gamma"] = [f"{value:.3f}" for value in frame["gamma"]]
-    mixed = [name for name in ("inclusion", "r_hat", "ess") if name in frame]
-    for name in mixed:
-        frame[name] = [f"{value:.0f}" if name == "ess" else f"{value:.3f}" for value in frame[name]]
-    shown = frame[["bias", "unit", *numbers, "gamma", *mixed, "status", *(["verdict"] if "verdict" in frame else [])]]
-    listed = shown.to_string(index=False, justify="right")
+        frame = frame.iloc[sorted(np.argsort(-sure, kind="stable")[:SHOWN])]
+    columns = [name for name in ("bias", "unit", *FORMS, "status", "verdict") if name in frame]
+    listed = formatted(frame[columns], FORMS).to_string(index=False, justify="right")
     return listed if whole <= MANY else f"{listed}\n{SHOWN} of {whole} biases, those that are surest not to be zero"
 
 
@@ -203,20 +201,9 @@ def _print_verdict(tree: xr.DataTree, seconds: float) -> None:
         if f"position_rmse_after{suffix}" in attrs:
             before, after = (attrs[f"position_rmse_{when}{suffix}"] for when in ("before", "after"))
             print(f"position RMSE before {before:.3f} m, after {after:.3f} m{how}")
-    _print_findings(tree)
+    say_findings(tree, FINDINGS, "(group finding of fit.nc, report.html)")
     if attrs["message"]:
         print(attrs["message"], file=sys.stdout if Status(attrs["status"]).settled else sys.stderr)
-
-
-def _print_findings(tree: xr.DataTree) -> None:
-    """The first sentences that an assessment has to say."""
-    if "finding" not in tree.children:
-        return
-    sentences = tree["finding"].to_dataset()["sentence"].values.tolist()
-    for sentence in sentences[:FINDINGS]:
-        print(f"- {sentence}")
-    if len(sentences) > FINDINGS:
-        print(f"- and {len(sentences) - FINDINGS} more (group finding of fit.nc, report.html)")
 
 
 def _write(tree: xr.DataTree, network: Network, outputs: Outputs) -> list[Path]:

@@ -119,14 +119,11 @@ def run(
     fitted = sum(found[path][0]["status"] != REFUSED for path, _ in missing)
     print(f"{len(files)} recordings, {fitted} of them fitted now, {time.perf_counter() - began:.1f} s")
     say_written([outputs.folder / "fits.csv"])
-    refused: dict[str, list[str]] = {}
-    for rows in found.values():
-        if rows[0]["status"] == REFUSED:
-            refused.setdefault(rows[0]["message"], []).append(rows[0]["recording"])
-    for message, names in refused.items():
-        print(f"{', '.join(names)}: {message}", file=sys.stderr)
-    states = {rows[0]["status"] for rows in found.values()}
-    return 0 if all(state != REFUSED and Status(state).settled for state in states) else 1
+    ended = pd.DataFrame([rows[0] for rows in found.values()])
+    refused = ended[ended["status"] == REFUSED]
+    for message, own in refused.groupby("message", sort=False) if len(refused) else ():
+        print(f"{', '.join(own['recording'])}: {message}", file=sys.stderr)
+    return 0 if all(state != REFUSED and Status(state).settled for state in ended["status"]) else 1
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from probcal.lazy import lazy
 from probcal.wings import PICTURES
 
 if TYPE_CHECKING:
-    from probcal.plots.assess import plot_changes, plot_halves, plot_left_out, plot_nis, plot_shrinkage
+    from probcal.plots.assess import draw_changes, plot_changes, plot_halves, plot_left_out, plot_nis, plot_shrinkage
     from probcal.plots.base import INTERVAL
     from probcal.plots.bounds import plot_bound_map, plot_sensitivity
     from probcal.plots.compare import draw_compare, plot_gammas, plot_methods, plot_pair
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 __all__ = lazy(
     __name__,
     {
-        "probcal.plots.assess": "plot_changes plot_halves plot_left_out plot_nis plot_shrinkage",
+        "probcal.plots.assess": "draw_changes plot_changes plot_halves plot_left_out plot_nis plot_shrinkage",
         "probcal.plots.base": "INTERVAL",
         "probcal.plots.bounds": "plot_bound_map plot_sensitivity",
         "probcal.plots.compare": "draw_compare plot_gammas plot_methods plot_pair",

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 
 from probcal.errors import InputError
-from probcal.plots.base import COLOURS, NAMED, new_axes, plain_text
+from probcal.plots.base import COLOURS, figure_of, finish, name_places, new_axes, plain_text
 
 SURFACE = "viridis"
 WIDE = 20.0  # ratio of largest to smallest value above which the colours are logarithmic
@@ -24,19 +24,13 @@ def plot_bound_map(found: xr.Dataset, ax: Axes | None = None) -> Axes:
         _surface(ax, found["x"].values, found["y"].values, values, "position bound in m", WIDE)
     nodes = found["node_position"].values[:, :2]
     ax.plot(*nodes.T, "s", color="black", markerfacecolor="white", markersize=6, zorder=4)
-    if len(nodes) <= NAMED:
-        for name, place in zip(found["node"].values, nodes, strict=True):
-            ax.annotate(
-                plain_text(name), place, xytext=(6, 6), textcoords="offset points", zorder=5, fontsize=8,
-                annotation_clip=True, bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.8},
-            )  # fmt: skip
+    name_places(ax, found["node"].values, nodes)
     for side, limit in ((found["x"].values, ax.set_xlim), (found["y"].values, ax.set_ylim)):
         half = np.ptp(side) / (2 * (len(side) - 1)) if len(side) > 1 else 0.5
         limit(side.min() - half, side.max() + half)
     height = f" at z = {float(found['z']):g} m" if "z" in found.coords else ""
-    ax.set(xlabel="x in m", ylabel="y in m")
-    ax.set_title(f"Least position error{height}, biases {plain_text(found.attrs['biases'])}", loc="left")
-    return ax
+    title = f"Least position error{height}, biases {plain_text(found.attrs['biases'])}"
+    return finish(ax, title, grid="", key=False, xlabel="x in m", ylabel="y in m")
 
 
 def plot_sensitivity(found: xr.Dataset, ax: Axes | None = None) -> Axes:
@@ -59,23 +53,19 @@ def plot_sensitivity(found: xr.Dataset, ax: Axes | None = None) -> Axes:
     down, across = dims
     values = np.ma.masked_array(found["rmse"].values)
     _surface(ax, found[across].values, found[down].values, values, "RMS position error in m", np.inf)
-    ax.set(xlabel=f"std of {plain_text(across)}", ylabel=f"std of {plain_text(down)}")
-    ax.set_title("Tracks that ignore the biases", loc="left")
-    return ax
+    right, up = (f"std of {plain_text(name)}" for name in (across, down))
+    return finish(ax, "Tracks that ignore the biases", grid="", key=False, xlabel=right, ylabel=up)
 
 
 def _surface(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, label: str, most: float) -> None:
     """Heat map of values (y, x) with its colour bar and contours; logarithmic where they span more than a ratio."""
     low, high = float(values.min()), float(values.max())
     wide = low > 0 and high > most * low
-    norm: Any = LogNorm(low, high) if wide else Normalize(low, high)
+    norm, spaced = (LogNorm(low, high), np.geomspace) if wide else (Normalize(low, high), np.linspace)
     drawn = ax.pcolormesh(x, y, values, cmap=SURFACE, norm=norm, shading="nearest", rasterized=True)
-    figure = ax.get_figure()
-    assert figure is not None
-    figure.colorbar(drawn, ax=ax, label=label, format="%g")
+    figure_of(ax).colorbar(drawn, ax=ax, label=label, format="%g")
     if min(values.shape) > 1 and high > low:
-        inner = np.geomspace(low, high, 8)[1:-1] if wide else np.linspace(low, high, 8)[1:-1]
-        levels = np.unique([float(f"{level:.2g}") for level in inner])
+        levels = np.unique([float(f"{level:.2g}") for level in spaced(low, high, 8)[1:-1]])
         levels = levels[(levels > low) & (levels < high)]
         if len(levels):
             lines = ax.contour(x, y, values, levels=levels, colors="white", linewidths=0.8)

@@ -5,14 +5,28 @@ from os import PathLike
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from probcal.analysis.compare import Fits, chosen_pair, fits_by_name, interchangeable, plugged_in
-from probcal.plots.base import LINEAR, ROWS, colour, ellipse_patch, new_axes, plain_text, probability, write_figure
+from probcal.plots.base import (
+    ROWS,
+    colour,
+    ellipse_patch,
+    finish,
+    most_first,
+    name_rows,
+    new_axes,
+    plain_text,
+    probability,
+    scale_axis,
+    write_figure,
+)
 from probcal.results.blocks import SensorBlocks
+from probcal.results.read import known_truth
 from probcal.status import INVALID
 
 SCATTER = 2_000  # draws of one fit in the picture of a pair
@@ -24,44 +38,37 @@ def plot_methods(comparison: xr.DataTree, ax: Axes | None = None) -> Axes:
     estimate = comparison["estimate"].to_dataset()
     total, names = estimate.sizes["bias_label"], estimate["estimator"].values.tolist()
     apart = comparison["pair"].to_dataset()["wasserstein"].max("pair").values
-    estimate = estimate.isel(bias_label=np.sort(np.argsort(-apart, kind="stable")[:ROWS]))
+    estimate = estimate.isel(bias_label=most_first(apart))
     labels, scale = estimate["bias_label"].values, estimate["scale"].values
     rows, count = np.arange(len(labels)), len(names)
-    ax = new_axes(ax, 9.0, min(1.8 + (0.16 + 0.09 * count) * len(rows), 30.0))
+    ax = new_axes(ax, 9.0, _height(count, len(rows)))
     for row in rows[::2]:
         ax.axhspan(row - 0.5, row + 0.5, color="0.96", zorder=0)
     ax.axvline(0.0, color="0.3", linewidth=0.8, zorder=1)
-    seen = [np.array([-1.0, 1.0])]
+    seen = []
     for k, name in enumerate(names):
         mine = estimate.sel(estimator=name)
         mean, lower, upper = (mine[column].values / scale for column in ("mean", "lower", "upper"))
         place = rows + (k - (count - 1) / 2) * 0.8 / count
         ax.hlines(place, lower, upper, color=colour(k), linewidth=1.6, zorder=2)
         status = comparison[f"method/{name}"].attrs["status"]
-        label = plain_text(name) + (f", {status}" if status in INVALID else "")
+        valid = status not in INVALID
+        label = plain_text(name) + ("" if valid else f", {status}")
         ax.plot(mean, place, "o", color=colour(k), markersize=3.5, label=label, zorder=3)
-        if status not in INVALID:
-            seen += [lower, upper]
-    if "truth" in comparison.children:
-        true = comparison["truth"].to_dataset()["bias"].to_series().reindex(labels).to_numpy() / scale
-        known = np.isfinite(true)
-        ax.plot(
-            true[known], rows[known], "|", color="#d00000", markersize=11, markeredgewidth=1.4, zorder=4, label="true"
-        )
-        seen.append(true[known])
-    low, high = (float(f(np.concatenate(seen))) for f in (np.min, np.max))
-    if max(-low, high) > LINEAR:
-        ax.set_xscale("symlog", linthresh=3.0)
-    margin = 0.04 * (high - low)
-    ax.set_xlim(low - margin, high + margin)  # what diverged is cut
-    ax.set_yticks(rows, [plain_text(label) for label in labels], fontsize=7.5)
-    ax.set_ylim(len(rows) - 0.4, -0.6)
-    ax.grid(axis="x", color="0.9", zorder=0)
-    ax.set_xlabel(f"bias in units of its scale, {probability(comparison):.0%} interval")
+        seen += [lower, upper] if valid else []  # what diverged is cut
+    true = known_truth(comparison).reindex(labels).to_numpy() / scale
+    if np.isfinite(true).any():
+        ax.plot(true, rows, "|", color="#d00000", markersize=11, markeredgewidth=1.4, zorder=4, label="true")
+    scale_axis(ax, *seen, true)
+    name_rows(ax, labels)
     some = f"{len(rows)} of {total} biases, those that differ most" if len(rows) < total else f"{total} biases"
-    ax.set_title(f"{some}, {count} methods", loc="left")
-    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
-    return ax
+    text = f"bias in units of its scale, {probability(comparison):.0%} interval"
+    return finish(ax, f"{some}, {count} methods", grid="x", xlabel=text)
+
+
+def _height(methods: int, biases: int) -> float:
+    """Height in inches of a forest."""
+    return min(1.8 + (0.16 + 0.09 * methods) * biases, 30.0)
 
 
 def plot_gammas(comparison: xr.DataTree, ax: Axes | None = None) -> Axes:
@@ -74,15 +81,12 @@ def plot_gammas(comparison: xr.DataTree, ax: Axes | None = None) -> Axes:
     for k, name in enumerate(others):
         method, tint = comparison[f"method/{name}"].to_dataset(), colour(k + 1)
         if "gamma_upper" in method:
-            ax.vlines(
-                across, method["gamma_lower"], method["gamma_upper"], color=tint, linewidth=0.9, alpha=0.5, zorder=2
-            )
+            ends = method["gamma_lower"], method["gamma_upper"]
+            ax.vlines(across, *ends, color=tint, linewidth=0.9, alpha=0.5, zorder=2)
         ax.plot(across, gamma.sel(estimator=name), "o", color=tint, markersize=4, label=plain_text(name), zorder=3)
-    ax.set(xlim=(-0.04, 1.04), ylim=(-0.04, 1.04), xlabel=f"gamma by {plain_text(first)}", ylabel="gamma by the others")
-    ax.grid(color="0.9")
-    ax.set_title("How well the data determine each bias (0 prior only)", loc="left")
-    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
-    return ax
+    title = "How well the data determine each bias (0 prior only)"
+    span = (-0.04, 1.04)
+    return finish(ax, title, xlim=span, ylim=span, xlabel=f"gamma by {plain_text(first)}", ylabel="gamma by the others")
 
 
 def plot_pair(fits: Fits, labels: Sequence[str], names: Sequence[str] | None = None, ax: Axes | None = None) -> Axes:
@@ -99,33 +103,25 @@ def plot_pair(fits: Fits, labels: Sequence[str], names: Sequence[str] | None = N
         group = tree["calibration"].to_dataset().sel(bias_label=[first, second])
         if name == plugged:
             covariance = SensorBlocks.read(group, [first, second], "plot_pair").matrix()
-            style: dict[str, Any] = {"facecolor": "none", "edgecolor": colour(k), "linewidth": 1.8, "zorder": 4}
-            ax.add_patch(ellipse_patch(group["mean"].values.tolist(), covariance, probability(tree), **style))
-            ax.plot(*group["mean"].values, "+", color=colour(k), markersize=9, markeredgewidth=1.8, zorder=4)
+            mean = group["mean"].values
+            style = {"facecolor": "none", "edgecolor": colour(k), "linewidth": 1.8, "zorder": 4}
+            ax.add_patch(ellipse_patch(mean, covariance, probability(tree), **style))
+            ax.plot(*mean, "+", color=colour(k), markersize=9, markeredgewidth=1.8, zorder=4)
             keys.append(Line2D([], [], color=colour(k), label=f"{plain_text(name)}, {probability(tree):.0%} ellipse"))
             continue
         draws = tree["posterior"].to_dataset()["bias"].sel(bias_label=[first, second])
-        z = draws.transpose("chain", "draw", "bias_label").values.reshape(-1, 2)
-        z = z[np.linspace(0, len(z) - 1, min(SCATTER, len(z))).astype(int)]
-        ax.plot(*z.T, ".", color=colour(k), markersize=2.5, alpha=0.4, zorder=2, rasterized=True)
+        z = draws.transpose("bias_label", "chain", "draw").values.reshape(2, -1)
+        z = z[:, np.linspace(0, z.shape[1] - 1, min(SCATTER, z.shape[1])).astype(int)]
+        ax.plot(*z, ".", color=colour(k), markersize=2.5, alpha=0.4, zorder=2, rasterized=True)
         keys.append(Line2D([], [], marker=".", linestyle="", color=colour(k), label=f"{plain_text(name)}, draws"))
-    true = {label: value for tree in known.values() for label, value in _true(tree).items()}
+    true = pd.concat([known_truth(tree) for tree in known.values()])
     if first in true and second in true:
-        ax.plot(true[first], true[second], "x", color="#d00000", markersize=8, markeredgewidth=1.8, zorder=5)
+        place = [true[[label]].iloc[-1] for label in (first, second)]
+        ax.plot(*place, "x", color="#d00000", markersize=8, markeredgewidth=1.8, zorder=5)
         keys.append(Line2D([], [], marker="x", linestyle="", color="#d00000", label="true"))
     unit = next(iter(known.values()))["calibration"].to_dataset()["unit"].to_series()
-    ax.set(xlabel=f"{plain_text(first)} [{unit[first]}]", ylabel=f"{plain_text(second)} [{unit[second]}]")
-    ax.grid(color="0.9")
-    ax.set_title("Posterior of a pair of biases", loc="left")
-    ax.legend(handles=keys, loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
-    return ax
-
-
-def _true(tree: xr.DataTree) -> dict[str, float]:
-    """True biases that a tree knows."""
-    if "truth" not in tree.children:
-        return {}
-    return {str(label): float(value) for label, value in tree["truth"].to_dataset()["bias"].to_series().items()}
+    across, up = (f"{plain_text(label)} [{unit[label]}]" for label in (first, second))
+    return finish(ax, "Posterior of a pair of biases", keys=keys, xlabel=across, ylabel=up)
 
 
 def draw_compare(
@@ -137,12 +133,11 @@ def draw_compare(
     """
     names = comparison["estimate"].to_dataset()["estimator"].values.tolist()
     known = fits_by_name(list(fits.values()) if isinstance(fits, Mapping) else fits, names)
-    estimate = comparison["estimate"].to_dataset()
-    labels = estimate["bias_label"].values.tolist()
+    labels = comparison["estimate"].to_dataset()["bias_label"].values.tolist()
     if not pairs:
         found = interchangeable(known[str(comparison.attrs["reference"])], count=PAIRS, among=labels)
         pairs = [(first, second) for first, second, _ in found]
-    height = min(1.8 + (0.16 + 0.09 * len(known)) * min(len(labels), ROWS), 30.0)
+    height = _height(len(known), min(len(labels), ROWS))
     figure = Figure(figsize=(17.0, max(height, 4.2 * (1 + len(pairs)))), layout="constrained")
     halves: Any = figure.subfigures(1, 2, width_ratios=[1.15, 1.0])
     left, right = halves

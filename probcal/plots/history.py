@@ -8,7 +8,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from probcal.errors import InputError, nearest
-from probcal.plots.base import BEFORE, SURE, colour, plain_text, write_figure
+from probcal.plots.base import BEFORE, SURE, colour, panels, plain_text, write_figure
 
 COLUMNS, PANELS = 4, 24  # panels of a row, and at most
 WIDTH, HEIGHT = 13.0, 2.2  # of the picture and of a row of panels, inches
@@ -30,37 +30,32 @@ def plot_history(
     """
     for column in ("time", "bias", "unit", "mean", "sd", "lower", "upper"):
         if column not in history:
-            raise InputError(
-                f'plot_history: the history has no column "{column}"{nearest(column, [str(name) for name in history])}'
-            )
+            raise InputError(f'plot_history: the history has no column "{column}"{nearest(column, map(str, history))}')
     last = history.drop_duplicates("bias", keep="last").set_index("bias")
     for label in labels or ():
         if label not in last.index:
-            raise InputError(
-                f'plot_history: no bias is called "{label}"{nearest(label, [str(name) for name in last.index])}'
-            )
+            raise InputError(f'plot_history: no bias is called "{label}"{nearest(label, last.index)}')
     far = (last["mean"].abs() / last["sd"]).sort_values(ascending=False).index[:PANELS]
     chosen = list(labels) if labels else [label for label in last.index if label in set(far)]
     rows = -(-len(chosen) // COLUMNS)
     figure = Figure(figsize=(WIDTH, HEIGHT * rows), layout="constrained")
-    axes = list(figure.subplots(rows, min(COLUMNS, len(chosen)), squeeze=False, sharex=True).ravel())
-    for spare in axes[len(chosen) :]:
-        spare.remove()
-    for k, (ax, label) in enumerate(zip(axes[: len(chosen)], chosen, strict=True)):
-        own = history[history["bias"] == label]
-        time = own["time"].to_numpy()
-        size, unit = (np.rad2deg(1.0), "deg") if own["unit"].iloc[0] == "rad" else (1.0, str(own["unit"].iloc[0]))
+    axes = panels(figure, len(chosen), min(COLUMNS, len(chosen)), sharex=True)
+    for k, (ax, label) in enumerate(zip(axes, chosen, strict=True)):
+        own, unit = history[history["bias"] == label], str(last["unit"][label])
+        time, mean, lower, upper = own[["time", "mean", "lower", "upper"]].to_numpy(float).T
+        if unit == "rad":
+            mean, lower, upper = np.rad2deg([mean, lower, upper])
         ax.axhline(0.0, color=BEFORE, linewidth=0.8)
-        ax.fill_between(time, own["lower"] * size, own["upper"] * size, color=colour(k), alpha=0.25, linewidth=0)
+        ax.fill_between(time, lower, upper, color=colour(k), alpha=0.25, linewidth=0)
         alone = np.ptp(time) == 0  # of one time no line is seen
         if alone:
-            ax.vlines(time, own["lower"] * size, own["upper"] * size, color=colour(k), alpha=0.5, linewidth=3.0)
-        ax.plot(time, own["mean"] * size, "o" if alone else "-", color=colour(k), linewidth=1.2)
+            ax.vlines(time, lower, upper, color=colour(k), alpha=0.5, linewidth=3.0)
+        ax.plot(time, mean, "o" if alone else "-", color=colour(k), linewidth=1.2)
         for _, jump in () if jumps is None else jumps[jumps["label"] == label].iterrows():
             ax.axvline(jump["since"], color=SURE, linewidth=0.8)
             ax.axvline(jump["found"], color=SURE, linewidth=0.8, linestyle=":")
         ax.set_title(plain_text(label, 34), fontsize=8)
-        ax.set_ylabel("" if unit == "1" else unit, fontsize=8)
+        ax.set_ylabel({"1": "", "rad": "deg"}.get(unit, unit), fontsize=8)
         ax.tick_params(labelsize=7)
     figure.supxlabel("time, s", fontsize=9)
     return figure

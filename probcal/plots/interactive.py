@@ -1,6 +1,7 @@
 """The map of a fit in a browser: zoom, a word on every node and epoch, layers before and after calibration."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,16 +18,18 @@ from bokeh.models import (
 )
 from bokeh.models.annotations.legends import ColorBar, Legend, LegendItem
 from bokeh.plotting import figure
+from matplotlib.colors import LinearSegmentedColormap, to_hex
+from matplotlib.ticker import MaxNLocator
 
 from probcal.geodesy import LocalFrame
 from probcal.labels import AXES
-from probcal.plots.base import BEFORE, FAINT, NAMED, SURE, colour, probability
-from probcal.plots.scene import Outline, Scene, Track, ellipse, scene
+from probcal.plots.base import BEFORE, FAINT, LISTED, NAMED, SURE, colour, probability
+from probcal.plots.scene import Outline, Scene, Track, ellipse, scene, thinned
+from probcal.results.read import frame_of
 
 POINTS = 5_000  # epochs of all tracks together
 CORNERS = 32  # of an ellipse
 ENCIRCLED = 500  # nodes above which there are no ellipses
-LISTED = 12  # targets in the legend, and biases in the words of a node
 LINES = 6  # meridians, and parallels, across the map
 MIDDLE = "#767676"  # readable on white and on black
 TEXT: dict[str, Any] = {"text_color": MIDDLE, "text_font_size": "12px"}
@@ -48,7 +51,14 @@ def interactive_map(tree: xr.DataTree) -> LayoutDOM:
     >>> interactive_map(tree).select_one({"name": "map"}).x_range.name
     'x'
     """
-    shown = scene(tree)
+    whole = scene(tree)
+    most, of_object = (max(2, POINTS // max(len(own), 1)) for own in (whole.tracks, whole.objects))
+    shown = replace(
+        whole,
+        tracks=[thinned(own, most) for own in whole.tracks],
+        mirrored=[thinned(own, most) for own in whole.mirrored],
+        objects=[thinned(own, of_object) for own in whole.objects],
+    )
     sources = _sources(tree, shown)
     plan = _panel(shown, sources, (0, 1), probability(tree))
     if shown.dimension == 2:
@@ -80,18 +90,17 @@ def _encircled(shown: Scene) -> bool:
 def _sources(tree: xr.DataTree, shown: Scene) -> dict[str, ColumnDataSource]:
     """Columns that all panels share: epochs, nodes."""
     nodes, d = shown.nodes, shown.dimension
-    most = max(2, POINTS // max(len(shown.tracks), 1))
-    tracks = [track.thin(most) for track in shown.tracks]
+    tracks = shown.tracks
+    sizes = [len(track.time) for track in tracks]
     epochs: dict[str, Any] = {
-        "target": [track.target for track in tracks for _ in track.time],
+        "target": np.repeat([track.target for track in tracks], sizes).tolist(),
         "time": np.concatenate([np.empty(0), *(track.time for track in tracks)]),
-        "colour": [colour(k) for k, track in enumerate(tracks) for _ in track.time],
+        "colour": np.repeat([colour(k) for k in range(len(tracks))], sizes).tolist(),
     }
+    places = np.concatenate([np.empty((0, d)), *(track.after for track in tracks)])
+    sds = np.concatenate([np.empty((0, d)), *(track.sd for track in tracks)]).astype("f4")
     for axis in range(d):
-        epochs[AXES[axis]] = np.concatenate([np.empty(0), *(track.after[:, axis] for track in tracks)])
-        epochs[f"sd_{AXES[axis]}"] = np.concatenate(
-            [np.empty(0, "f4"), *(track.sd[:, axis].astype("f4") for track in tracks)]
-        )
+        epochs[AXES[axis]], epochs[f"sd_{AXES[axis]}"] = places[:, axis], sds[:, axis]
     points: dict[str, Any] = {"name": nodes.name.tolist(), "words": list(_words(tree, shown))}
     for axis in range(d):
         points[AXES[axis]], points[f"to_{AXES[axis]}"] = nodes.stated[:, axis], nodes.calibrated[:, axis]
@@ -100,19 +109,14 @@ def _sources(tree: xr.DataTree, shown: Scene) -> dict[str, ColumnDataSource]:
 
 def _words(tree: xr.DataTree, shown: Scene) -> Iterator[str]:
     """What the map says of each node: where it is, and its biases and those of its sensors."""
-    group, constant = tree["calibration"].to_dataset(), tree["constant_data"].to_dataset()
-    owners = group["owner"].values.tolist() if "owner" in group else [""] * group.sizes["bias_label"]
-    said: dict[str, list[str]] = {}
-    columns = (group[name].values.tolist() for name in ("bias_label", "mean", "sd", "unit"))
-    for owner, label, mean, sd, unit in zip(owners, *columns, strict=True):
-        value = f"{mean:.4g} ± {sd:.2g} {'' if unit == '1' else unit}".rstrip()
-        said.setdefault(owner, []).append(f"{label.removeprefix(f'{owner}.')} {value}")
-    placed: dict[str, list[str]] = {}
-    if "placement" in constant.dims:
-        for sensor, node in zip(constant["placed_sensor"].values, constant["placed_node"].values, strict=True):
-            placed.setdefault(str(node), []).append(str(sensor))
+    constant, said = tree["constant_data"].to_dataset(), dict[str, list[str]]()
+    for row in frame_of(tree, "calibration", "owner", "mean", "sd", "unit").itertuples():
+        value = f"{row.mean:.4g} ± {row.sd:.2g} {'' if row.unit == '1' else row.unit}".rstrip()
+        said.setdefault(row.owner, []).append(f"{row.Index.removeprefix(f'{row.owner}.')} {value}")
+    placed = list(zip(constant["placed_node"].values, constant["placed_sensor"].values, strict=True))
     for name, place in zip(shown.nodes.name.tolist(), shown.nodes.stated, strict=True):
-        own = [text for owner in dict.fromkeys([name, *placed.get(name, [])]) for text in said.get(owner, [])]
+        owners = dict.fromkeys([name, *(sensor for node, sensor in placed if node == name)])
+        own = [text for owner in owners for text in said.get(owner, [])]
         more = [f"and {len(own) - LISTED} more"] if len(own) > LISTED else []
         where = ", ".join(f"{axis} {value:.6g}" for axis, value in zip(AXES, place, strict=False))
         yield "\n".join([f"stated {where} m", *own[:LISTED], *more])
@@ -153,25 +157,25 @@ def _panel(shown: Scene, sources: dict[str, ColumnDataSource], axes: tuple[int, 
 
 def _draw_views(sheet: figure, views: list[Outline]) -> None:
     """Where the view of each sensor ends; filled where one line goes round it."""
-    columns: dict[str, list[Any]] = {"xs": [], "ys": [], "colour": [], "fill": [], "sensor": []}
-    for k, own in enumerate(views):
-        for line in own.lines:
-            one = (line[:, 0], line[:, 1], colour(k), 0.05 if own.whole else 0.0, own.sensor)
-            for name, value in zip(columns, one, strict=True):
-                columns[name].append(value)
-    if columns["xs"]:
-        source = ColumnDataSource(data=columns)
+    lines = [
+        (*line.T, colour(k), 0.05 if own.whole else 0.0, own.sensor)
+        for k, own in enumerate(views)
+        for line in own.lines
+    ]
+    if lines:
+        names = ("xs", "ys", "colour", "fill", "sensor")
+        source = ColumnDataSource(data=dict(zip(names, map(list, zip(*lines, strict=True)), strict=True)))
         _tagged("views", sheet.patches("xs", "ys", source=source, color="colour", alpha="fill", line_color=None))
         ends = sheet.multi_line("xs", "ys", source=source, line_color="colour", line_dash="dotdash", line_alpha=0.7)
         said = "<b>@sensor</b><div>its view ends here</div>"
-        sheet.add_tools(HoverTool(renderers=[_tagged("views", ends)], tooltips=said, visible=False, name="views"))
+        _hover(sheet, [_tagged("views", ends)], said, name="views", visible=False)
 
 
 def _draw_objects(sheet: figure, shown: Scene, plane: list[int]) -> None:
     """Objects that nobody named, by existence, with a bar that says which colour is how sure."""
     if not shown.objects:
         return
-    tracks = [own.thin(max(2, POINTS // len(shown.objects))) for own in shown.objects]
+    tracks = shown.objects
     sure = np.concatenate([own.existence[1:] for own in tracks])
     columns: dict[str, Any] = {
         "name": [own.name for own in tracks for _ in own.time[1:]],
@@ -186,9 +190,7 @@ def _draw_objects(sheet: figure, shown: Scene, plane: list[int]) -> None:
         line_color={"field": "existence", "transform": tint},
     )  # fmt: skip
     said = "<b>@name</b><div>time @time{0.000} s</div><div>existence @existence{0.00}</div>"
-    sheet.add_tools(
-        HoverTool(renderers=[_tagged("objects", band)], tooltips=said, description="Objects", name="objects")
-    )
+    _hover(sheet, [_tagged("objects", band)], said, name="objects", description="Objects")
     if plane == [0, 1]:
         bar = ColorBar(
             color_mapper=tint, title="existence", width=10, height=120, background_fill_alpha=0.0, location=(0, 0),
@@ -199,28 +201,24 @@ def _draw_objects(sheet: figure, shown: Scene, plane: list[int]) -> None:
 
 def shades(first: str, last: str, count: int = 64) -> list[str]:
     """Colours from one to another, in even steps."""
-    ends = np.array([[int(text[k : k + 2], 16) for k in (1, 3, 5)] for text in (first, last)])
-    steps = ends[0] + np.linspace(0.0, 1.0, count)[:, None] * (ends[1] - ends[0])
-    return [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in steps.round().astype(int).tolist()]
+    return [to_hex(colour) for colour in LinearSegmentedColormap.from_list("", [first, last], count)(range(count))]
 
 
 def _draw_tracks(sheet: figure, shown: Scene, epochs: ColumnDataSource, plane: list[int]) -> None:
     """Lines by layer, and a dot at each epoch that says where it is."""
-    most = max(2, POINTS // max(len(shown.tracks), 1))
-    tracks = [track.thin(most) for track in shown.tracks]
+    tracks = shown.tracks
 
     def lines(tag: str, chosen: Sequence[Track], part: str, **style: Any) -> Any:
-        places = [getattr(track, part)[:, plane].T for track in chosen]
-        columns = {"xs": [p[0] for p in places], "ys": [p[1] for p in places]}
-        source = ColumnDataSource(data=columns | {"colour": [colour(k) for k in range(len(chosen))]})
-        return _tagged(tag, sheet.multi_line("xs", "ys", source=source, **({"line_color": "colour"} | style)))
+        xs, ys = ([getattr(track, part)[:, axis] for track in chosen] for axis in plane)
+        tints = [colour(k) for k in range(len(chosen))]
+        return _tagged(tag, sheet.multi_line(xs, ys, **({"line_color": tints} | style)))
 
     if not tracks:
         return
     alone = [track for track in tracks if len(track.time) == 1]  # a line of one point is none
-    for tag, part, marker in (("before", "before", "circle"), ("truth", "true", "x")) if alone else ():
+    marks = (("before", "before", "circle", BEFORE), ("truth", "true", "x", MIDDLE))
+    for tag, part, marker, tint in marks if alone else ():
         u, v = np.array([getattr(track, part)[0, plane] for track in alone]).T
-        tint = BEFORE if tag == "before" else MIDDLE
         _tagged(tag, sheet.scatter(u, v, marker=marker, size=6, fill_color=tint, line_color=tint))
     lines("before", tracks, "before", line_color=BEFORE, line_width=1)
     after = lines("after", tracks, "after", line_width=1.5)
@@ -231,14 +229,14 @@ def _draw_tracks(sheet: figure, shown: Scene, epochs: ColumnDataSource, plane: l
         _tagged("mirror", sheet.line(u, v, line_dash="dashed", line_color=MIDDLE))
         _tagged("mirror", sheet.scatter(u[1:], v[1:], size=9, fill_color=None, line_color=MIDDLE))
     if shown.mirrored:
-        lines("mirror", [track.thin(most) for track in shown.mirrored], "after", line_dash="dashed", line_width=1.5)
+        lines("mirror", shown.mirrored, "after", line_dash="dashed", line_width=1.5)
     x, y = (AXES[axis] for axis in plane)
     size = 6 if len(alone) == len(tracks) else 3
     dots = _tagged("after", sheet.scatter(x, y, source=epochs, size=size, fill_color="colour", line_color=None))
     axes = AXES[: shown.dimension]
     where = "".join(f"<div>{axis} @{axis}{{0.000}} ± @sd_{axis}{{0.000}} m</div>" for axis in axes)
     said = f"<b>@target</b><div>time @time{{0.000}} s</div>{where}"
-    sheet.add_tools(HoverTool(renderers=[dots], tooltips=said, description="Epochs", name="epochs"))
+    _hover(sheet, [dots], said, name="epochs", description="Epochs")
     if plane == [0, 1] and 1 < len(tracks) <= LISTED:
         items = [LegendItem(label=track.target, renderers=[after], index=k) for k, track in enumerate(tracks)]
         key: dict[str, Any] = {"items": items, "border_line_color": None, "background_fill_alpha": 0.5}
@@ -250,33 +248,29 @@ def _draw_nodes(sheet: figure, shown: Scene, source: ColumnDataSource, plane: li
     nodes, (x, y) = shown.nodes, (AXES[axis] for axis in plane)
     moved = nodes.calibrated[:, plane]
     if _encircled(shown):
-        rings = [
-            _ring(moved[k], nodes.covariance[k][np.ix_(plane, plane)], probability) for k in np.flatnonzero(nodes.free)
-        ]
-        rings = [ring for ring in rings if np.isfinite(ring).all()]
-        corners = ColumnDataSource(data={"xs": [ring[0] for ring in rings], "ys": [ring[1] for ring in rings]})
+        spread = nodes.covariance[:, plane][:, :, plane]
+        known = nodes.free & np.isfinite(moved).all(1) & np.isfinite(spread).all((1, 2))
+        rings = np.reshape([_ring(moved[k], spread[k], probability) for k in np.flatnonzero(known)], (-1, 2, CORNERS))
         style: dict[str, Any] = {"fill_color": MIDDLE, "fill_alpha": 0.2, "line_color": MIDDLE}
-        _tagged("ellipses", sheet.patches("xs", "ys", source=corners, **style))
+        _tagged("ellipses", sheet.patches(list(rings[:, 0]), list(rings[:, 1]), **style))
     sheet.segment(x, y, f"to_{x}", f"to_{y}", source=source, line_color=MIDDLE, line_width=1.5)
     turned = np.isfinite(nodes.heading)
     if plane == [0, 1] and turned.any():
         size = 0.04 * float((shown.high - shown.low)[:2].max())
-        tips = moved[turned] + size * np.stack([np.cos(nodes.heading[turned]), np.sin(nodes.heading[turned])], 1)
+        heading = nodes.heading[turned]
+        tips = moved[turned] + size * np.stack([np.cos(heading), np.sin(heading)], 1)
         sheet.segment(*moved[turned].T, *tips.T, line_color="#d00000", line_width=2)
     stated = sheet.scatter(x, y, source=source, marker="square", size=10, fill_color=None, line_color=MIDDLE)
     found = sheet.scatter(f"to_{x}", f"to_{y}", source=source, size=6, fill_color=MIDDLE, line_color=None)
     said = '<b>@name</b><div style="white-space: pre-line">@words</div>'
-    sheet.add_tools(HoverTool(renderers=[stated, found], tooltips=said, description="Nodes", name="nodes"))
+    _hover(sheet, [stated, found], said, name="nodes", description="Nodes")
     if plane == [0, 1] and len(nodes.name) <= NAMED:
         at = nodes.named
         inner = at[:, 0] < shown.low[0] + 0.75 * (shown.high - shown.low)[0]  # names stay on the sheet
         side: dict[str, Any] = {
             "x_offset": np.where(inner, 8, -8), "text_align": np.where(inner, "left", "right").tolist()
         }  # fmt: skip
-        columns = {"x": at[:, 0], "y": at[:, 1], "name": nodes.name.tolist()} | side
-        named = ColumnDataSource(data=columns)
-        aside: dict[str, Any] = {key: key for key in side}
-        _tagged("names", sheet.text("x", "y", text="name", source=named, y_offset=-6, **aside, **TEXT))
+        _tagged("names", sheet.text(at[:, 0], at[:, 1], text=nodes.name.tolist(), y_offset=-6, **side, **TEXT))
 
 
 def _tagged(layer: str, renderer: Any) -> Any:
@@ -284,13 +278,17 @@ def _tagged(layer: str, renderer: Any) -> Any:
     return renderer
 
 
+def _hover(sheet: figure, renderers: list[Any], text: str, **options: Any) -> None:
+    """Show a text where the pointer is on what is drawn."""
+    sheet.add_tools(HoverTool(renderers=renderers, tooltips=text, **options))
+
+
 def _ring(centre: np.ndarray, covariance: np.ndarray, probability: float) -> np.ndarray:
     """Corners (2, CORNERS) of an ellipse."""
     width, height, angle = ellipse(covariance, probability)
-    turn = np.linspace(0.0, 2 * np.pi, CORNERS, endpoint=False)
-    along, across = width / 2 * np.cos(turn), height / 2 * np.sin(turn)
-    c, s = np.cos(angle), np.sin(angle)
-    return np.stack([centre[0] + c * along - s * across, centre[1] + s * along + c * across])
+    turn = np.exp(1j * np.linspace(0.0, 2 * np.pi, CORNERS, endpoint=False))
+    corners = np.exp(1j * angle) * (width / 2 * turn.real + 0.5j * height * turn.imag)
+    return np.stack([centre[0] + corners.real, centre[1] + corners.imag])
 
 
 # Meridians and parallels
@@ -298,13 +296,13 @@ def _ring(centre: np.ndarray, covariance: np.ndarray, probability: float) -> np.
 
 def _draw_graticule(sheet: figure, frame: LocalFrame, low: np.ndarray, high: np.ndarray, dimension: int) -> None:
     """Meridians and parallels at round degrees over three times the map, named where they enter it."""
-    lines = list(graticule(frame, low, high, dimension))
-    places = ColumnDataSource(data={"xs": [line[:, 0] for _, line in lines], "ys": [line[:, 1] for _, line in lines]})
-    sheet.multi_line("xs", "ys", source=places, line_color=MIDDLE, line_alpha=0.45, line_dash="dotdash")
-    entries = [(text, line[((line > low) & (line < high)).all(1)][:1]) for text, line in lines]
-    named = [(text, *place[0].tolist()) for text, place in entries if len(place)]
-    columns = {key: [entry[k] for entry in named] for k, key in enumerate(("text", "x", "y"))}
-    sheet.text("x", "y", text="text", source=ColumnDataSource(data=columns), x_offset=3, y_offset=-2, **TEXT)
+    lines: list[Any] = list(graticule(frame, low, high, dimension))
+    xs, ys = ([line[:, axis] for _, line in lines] for axis in (0, 1))
+    sheet.multi_line(xs, ys, line_color=MIDDLE, line_alpha=0.45, line_dash="dotdash")
+    inside = [(text, line[((line > low) & (line < high)).all(1)][:1]) for text, line in lines]
+    named = [text for text, place in inside if len(place)]
+    at = np.concatenate([np.empty((0, 2)), *(place for _, place in inside)])
+    sheet.text(at[:, 0], at[:, 1], text=named, x_offset=3, y_offset=-2, **TEXT)
 
 
 def graticule(frame: LocalFrame, low: np.ndarray, high: np.ndarray, dimension: int) -> Iterator[tuple[str, np.ndarray]]:
@@ -318,18 +316,11 @@ def graticule(frame: LocalFrame, low: np.ndarray, high: np.ndarray, dimension: i
     spans = [(part.min(), part.max()) for part in (latitude, longitude)]
     height = [] if dimension == 2 else [frame.height]
     for own, (first, last) in enumerate(spans):
-        step = _round_step((last - first) / (3 * LINES))
+        values: Any = MaxNLocator(3 * LINES, steps=[1, 2, 5, 10]).tick_values(first, last)
         along = np.linspace(*spans[1 - own], 61)
-        for value in np.arange(np.ceil(first / step), np.floor(last / step) + 1) * step:
-            fixed = np.full(len(along), value)
-            pair = (fixed, along) if own == 0 else (along, fixed)
-            side = ("N", "S") if own == 0 else ("E", "W")
+        for value in values[(values >= first) & (values <= last)]:
+            place = [np.full(len(along), value), along]
             shown = value if own == 0 else (value + 180.0) % 360.0 - 180.0
-            text = f"{np.format_float_positional(abs(round(shown, 9)), trim='-')}° {side[int(shown < 0)]}"
-            yield text, frame.to_local(*pair, *height)[:, :2]
-
-
-def _round_step(step: float) -> float:
-    """The next of 1, 2 and 5 times a power of ten."""
-    power = 10.0 ** np.floor(np.log10(step))
-    return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= step * (1 - 1e-9))
+            side = ("NS", "EW")[own][int(shown < 0)]
+            text = f"{np.format_float_positional(abs(round(shown, 9)), trim='-')}° {side}"
+            yield text, frame.to_local(*(place if own == 0 else place[::-1]), *height)[:, :2]

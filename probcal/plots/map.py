@@ -1,7 +1,6 @@
 """The map of a fit, for print: nodes and tracks before and after calibration."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -10,23 +9,25 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.lines import Line2D
-from matplotlib.patches import FancyArrowPatch, Polygon
+from matplotlib.patches import Polygon
 
 from probcal.plots.base import (
     ALL_POINTS,
     BEFORE,
-    NAMED,
+    FEW,
     PALE,
     POINTS,
     SURE,
     colour,
     ellipse_patch,
     figure_of,
+    finish,
+    name_places,
     new_axes,
     plain_text,
     probability,
 )
-from probcal.plots.scene import Found, Outline, Places, Track, scene
+from probcal.plots.scene import Found, Outline, Places, Track, scene, thinned
 
 
 def plot_map(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
@@ -44,10 +45,8 @@ def plot_map(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     keys = _draw_views(ax, shown.views) + _draw_objects(ax, shown.objects)
     keys += _draw_tracks(ax, shown.tracks) + _draw_mirrored(ax, shown.mirrored, shown.elsewhere)
     keys += _draw_nodes(ax, shown.nodes, probability(tree))
-    ax.set(xlabel="x in m", ylabel="y in m")
-    ax.set_title("Map of nodes and tracks" + (" (x-y plane, z not shown)" if shown.dimension > 2 else ""), loc="left")
-    ax.legend(handles=keys, loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
-    return ax
+    title = "Map of nodes and tracks" + (" (x-y plane, z not shown)" if shown.dimension > 2 else "")
+    return finish(ax, title, grid="", keys=keys, xlabel="x in m", ylabel="y in m")
 
 
 def _most(tracks: Sequence[Track]) -> int:
@@ -71,7 +70,7 @@ def _draw_objects(ax: Axes, objects: list[Found]) -> list[Line2D]:
         return []
     most, tint = max(2, ALL_POINTS // len(objects)), LinearSegmentedColormap.from_list("existence", [PALE, SURE])
     for whole in objects:
-        own = whole.thin(most)
+        own = thinned(whole, most)
         places, sure = own.position[:, :2], own.existence[1:]
         lines = list(np.stack([places[:-1], places[1:]], 1))
         ax.add_collection(
@@ -85,7 +84,7 @@ def _draw_objects(ax: Axes, objects: list[Found]) -> list[Line2D]:
 def _draw_mirrored(ax: Axes, tracks: list[Track], elsewhere: np.ndarray) -> list[Line2D]:
     """Draw the tracks and the nodes of the other side and return the legend entry."""
     for k, track in enumerate(tracks):
-        places = track.thin(_most(tracks)).after[:, :2]
+        places = thinned(track, _most(tracks)).after[:, :2]
         ax.plot(*places.T, "--", color=colour(k), linewidth=1.0, alpha=0.7, zorder=2.5)
     for way in elsewhere:
         ax.plot(*way[:, :2].T, "--", color="0.3", linewidth=0.8, zorder=4)
@@ -98,52 +97,41 @@ def _draw_tracks(ax: Axes, tracks: list[Track]) -> list[Line2D]:
     """Draw all tracks and return the legend entries."""
     true = False
     for k, whole in enumerate(tracks):
-        track = whole.thin(_most(tracks))
-        before, after = track.before[:, :2], track.after[:, :2]
-        if len(after) == 1:
-            ax.plot(*before.T, "o", color=BEFORE, markersize=3, zorder=2)
-            ax.plot(*after.T, "o", color=colour(k), markersize=5, zorder=3)
-        else:
-            ax.plot(*before.T, "-", color=BEFORE, linewidth=0.7, zorder=2)
-            ax.plot(*after.T, "-", color=colour(k), linewidth=1.2, zorder=3)
+        track = thinned(whole, _most(tracks))
+        line, point = ("o", "x") if len(track.time) == 1 else ("-", ":")
+        ax.plot(*track.before[:, :2].T, line, color=BEFORE, linewidth=0.7, markersize=3, zorder=2)
+        ax.plot(*track.after[:, :2].T, line, color=colour(k), linewidth=1.2, markersize=5, zorder=3)
         if np.isfinite(track.true).any():
             true = True
-            ax.plot(*track.true[:, :2].T, "x" if len(after) == 1 else ":", color="0.1", linewidth=1.0, zorder=3.5)
+            ax.plot(*track.true[:, :2].T, point, color="0.1", linewidth=1.0, zorder=3.5)
     keys = [Line2D([], [], color=BEFORE, linewidth=0.9, label="before calibration")] if tracks else []
     keys += [Line2D([], [], color="0.1", linestyle=":", label="truth")] if true else []
     if len(tracks) > 12:
         return [*keys, Line2D([], [], color=colour(0), label=f"{len(tracks)} targets, after")]
     for k, track in enumerate(tracks):
-        style: dict[str, Any] = {"marker": "o", "linestyle": ""} if len(track.after) == 1 else {"linestyle": "-"}
-        keys.append(Line2D([], [], color=colour(k), markersize=5, label=f"{plain_text(track.target)}, after", **style))
+        line, text = "o" if len(track.time) == 1 else "-", f"{plain_text(track.target)}, after"
+        keys += ax.plot([], [], line, color=colour(k), markersize=5, label=text)
     return keys
 
 
 def _draw_nodes(ax: Axes, nodes: Places, probability: float) -> list[Line2D]:
     """Draw all nodes and return the legend entries."""
-    stated, calibrated, few = nodes.stated[:, :2], nodes.calibrated[:, :2], len(nodes.name) <= 25
-    keys = []
+    stated, calibrated, few = nodes.stated[:, :2], nodes.calibrated[:, :2], len(nodes.name) <= FEW
+    keys = list[Line2D]()
     for moving, marker, text in ((False, "s", "stated position"), (True, "D", "start of a moving node")):
         chosen = nodes.moving == moving
         if chosen.any():
-            style: dict[str, Any] = {"color": "black", "markerfacecolor": "none", "markersize": 7 if few else 4}
-            ax.plot(*stated[chosen].T, marker, zorder=5, **style)
-            keys.append(Line2D([], [], marker=marker, linestyle="", label=text, **style))
+            size = 7 if few else 4
+            keys += ax.plot(
+                *stated[chosen].T, marker, zorder=5, color="black", markerfacecolor="none", markersize=size, label=text
+            )
     if nodes.free.any():
-        ax.plot(*calibrated[nodes.free].T, ".", color="black", markersize=6, zorder=6)
+        label = f"calibrated, {probability:.0%} ellipse"
+        keys += ax.plot(*calibrated[nodes.free].T, ".", color="black", markersize=6, zorder=6, label=label)
         for k in np.flatnonzero(nodes.free):
             _draw_shift(ax, stated[k], calibrated[k], nodes.covariance[k, :2, :2], probability)
-        label = f"calibrated, {probability:.0%} ellipse"
-        keys.append(Line2D([], [], marker=".", linestyle="", color="black", label=label))
-    keys += _draw_headings(ax, nodes)
-    box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.8}
-    if len(nodes.name) <= NAMED:
-        for name, place in zip(nodes.name, nodes.named[:, :2], strict=True):
-            ax.annotate(
-                plain_text(name), place, xytext=(6, 6), textcoords="offset points", zorder=7, bbox=box,
-                fontsize=8 if few else 6, annotation_clip=True,
-            )  # fmt: skip
-    return keys
+    name_places(ax, nodes.name, nodes.named[:, :2])
+    return keys + _draw_headings(ax, nodes)
 
 
 def _draw_shift(ax: Axes, start: np.ndarray, end: np.ndarray, covariance: np.ndarray, probability: float) -> None:
@@ -151,12 +139,12 @@ def _draw_shift(ax: Axes, start: np.ndarray, end: np.ndarray, covariance: np.nda
     if not np.isfinite(end).all():
         return
     if np.linalg.norm(end - start) > 0.01 * np.ptp(ax.get_xlim()):
-        style: dict[str, Any] = {"arrowstyle": "->", "mutation_scale": 10.0, "shrinkA": 0.0, "shrinkB": 0.0}
-        ax.add_patch(FancyArrowPatch(tuple(start), tuple(end), color="black", linewidth=0.9, zorder=5, **style))
+        arrow = {"arrowstyle": "->", "mutation_scale": 10.0, "shrinkA": 0.0, "shrinkB": 0.0, "linewidth": 0.9}
+        ax.annotate("", tuple(end), tuple(start), arrowprops=arrow, zorder=5)
     if not np.isfinite(covariance).all():
         return
-    shape: dict[str, Any] = {"facecolor": "#00000018", "edgecolor": "black", "linewidth": 0.8, "zorder": 4}
-    ax.add_patch(ellipse_patch(end.tolist(), covariance, probability, **shape))
+    shape = {"facecolor": "#00000018", "edgecolor": "black", "linewidth": 0.8, "zorder": 4}
+    ax.add_patch(ellipse_patch(end, covariance, probability, **shape))
 
 
 def _draw_headings(ax: Axes, nodes: Places) -> list[Line2D]:
@@ -167,7 +155,7 @@ def _draw_headings(ax: Axes, nodes: Places) -> list[Line2D]:
     angle = nodes.heading[turned]
     ax.quiver(
         *nodes.calibrated[turned, :2].T, np.cos(angle), np.sin(angle), color="#d00000", angles="xy",
-        scale_units="width", scale=22.0 if len(nodes.name) <= 25 else 45.0, width=0.004,
+        scale_units="width", scale=22.0 if len(nodes.name) <= FEW else 45.0, width=0.004,
         headwidth=1.0, headlength=0.0, headaxislength=0.0, zorder=5,
     )  # fmt: skip
     return [Line2D([], [], color="#d00000", label="calibrated heading")]

@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from probcal.errors import InputError
-from probcal.plots.base import ALL_POINTS, SURE, colour, plain_text
+from probcal.plots.base import ALL_POINTS, LISTED, SURE, colour, finish, plain_text
 
-LISTED = 12  # objects in the legend
 THERE = 0.5  # existence from which an object is counted
 
 
@@ -30,24 +29,19 @@ def plot_objects(tree: xr.DataTree, axes: Sequence[Axes] | None = None) -> list[
         figure = Figure(figsize=(9.0, 4.8), layout="constrained")
         axes = list(figure.subplots(2, 1, sharex=True, height_ratios=(3, 2)))
     above, below = axes
-    names = list(dict.fromkeys(frame["track"]))
+    names = frame["track"].unique()
     step = max(1, len(frame) // ALL_POINTS + 1)
     for k, (name, own) in enumerate(frame.groupby("track", sort=False)):
         label = plain_text(name) if len(names) <= LISTED else None
         above.plot(own["time"][::step], own["existence"][::step], color=colour(k), linewidth=1.1, label=label)
-    above.set(ylim=(-0.03, 1.03), ylabel="existence")
-    above.grid(color="0.9")
-    above.set_title(f"Existence of {len(names)} object{'' if len(names) == 1 else 's'} over time", loc="left")
-    if names and len(names) <= LISTED:
-        above.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
+    title = f"Existence of {len(names)} object{'' if len(names) == 1 else 's'} over time"
+    finish(above, title, key=0 < len(names) <= LISTED, ylim=(-0.03, 1.03), ylabel="existence")
     time, mean, count = counted(frame)
     below.plot(time, mean, color="0.55", linewidth=1.0, drawstyle="steps-post", label="mean number")
     below.plot(time, count, color=SURE, linewidth=1.3, drawstyle="steps-post", label=f"existence above {THERE}")
-    below.set(xlabel="time in s", ylabel="objects", ylim=(0.0, max([1.0, *mean, *count]) + 0.5))
     below.yaxis.set_major_locator(MaxNLocator(integer=True))
-    below.grid(color="0.9")
-    below.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
-    return [above, below]
+    highest = max([1.0, *mean, *count]) + 0.5
+    return [above, finish(below, "", xlabel="time in s", ylabel="objects", ylim=(0.0, highest))]
 
 
 def counted(frame: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from probcal.labels import label_parts
-from probcal.plots.base import BEFORE, GAMMA, NAMED, colour, new_axes, plain_text, write_figure
+from probcal.plots.base import BEFORE, GAMMA, NAMED, colour, finish, name_places, new_axes, plain_text, write_figure
 from probcal.plots.bounds import plot_bound_map
 from probcal.results.read import each_target
 
@@ -31,12 +31,10 @@ def plot_spectrum(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     ax.semilogy(number[~weak], shown[~weak], "o", color=colour(0), markersize=4, label="determined by the data")
     ax.semilogy(number[weak], shown[weak], "v", color=colour(1), markersize=5, label="weak: left to prior and survey")
     ax.axhline(1.0, color="0.3", linewidth=0.8)
-    ax.set(xlabel="eigenvalue", ylabel="information in prior scales")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.grid(color="0.9")
-    ax.set_title(f"{int(weak.sum())} of {len(values)} directions are weak", loc="left")
     ax.legend(frameon=False, fontsize=8)
-    return ax
+    title = f"{int(weak.sum())} of {len(values)} directions are weak"
+    return finish(ax, title, key=False, xlabel="eigenvalue", ylabel="information in prior scales")
 
 
 def plot_directions(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
@@ -44,6 +42,7 @@ def plot_directions(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     ax = new_axes(ax, 9.0, 6.0)
     ax.set_aspect("equal", adjustable="box")
     keys = _draw_scene(ax, tree)
+    title = "The data determine every direction"
     if "direction" in tree.children:
         group = tree["direction"].to_dataset()
         (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
@@ -56,11 +55,7 @@ def plot_directions(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
             keys.append(Line2D([], [], color=colour(k), label=text))
         left = group.sizes["direction"] - SHOWN
         title = f"Directions that the data hardly determine{f', {left} more not shown' if left > 0 else ''}"
-    else:
-        title = "The data determine every direction"
-    ax.set_title(title, loc="left")
-    ax.legend(handles=keys, loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=8)
-    return ax
+    return finish(ax, title, grid="", keys=keys)
 
 
 def plot_passes(tree: xr.DataTree, passes: xr.Dataset, ax: Axes | None = None) -> Axes:
@@ -72,12 +67,11 @@ def plot_passes(tree: xr.DataTree, passes: xr.Dataset, ax: Axes | None = None) -
     shade = ax.scatter([], [], c=[], cmap=GAMMA, vmin=float(gain.min()), vmax=float(gain.max()))
     for k in reversed(range(len(gain))):
         path = passes["path"].values[k][:, :2]
-        style: dict[str, Any] = {"color": shade.to_rgba(gain[k]), "linewidth": 3.0 if k == 0 else 1.2, "zorder": 3}
-        ax.plot(*path.T, "o" if len(path) == 1 else "-", **style)
+        mark, width = "o" if len(path) == 1 else "-", 3.0 if k == 0 else 1.2
+        ax.plot(*path.T, mark, color=shade.to_rgba(gain[k]), linewidth=width, zorder=3)
     ax.figure.colorbar(shade, ax=ax, label="information gain in nats", shrink=0.8)
-    ax.set_title("What one more pass would tell about the biases", loc="left")
     ax.legend(handles=keys, loc="upper left", frameon=True, fontsize=8)
-    return ax
+    return finish(ax, "What one more pass would tell about the biases", grid="", key=False)
 
 
 def draw_check(tree: xr.DataTree, passes: xr.Dataset, bound: xr.Dataset, path: str | PathLike[str]) -> None:
@@ -102,9 +96,7 @@ def _draw_scene(ax: Axes, tree: xr.DataTree) -> list[Line2D]:
     stated = nodes["node_position"].values[:, :2]
     style: dict[str, Any] = {"color": "black", "markerfacecolor": "none", "markersize": 6}
     ax.plot(*stated.T, "s", zorder=5, **style)
-    if len(stated) <= NAMED:
-        for name, place in zip(nodes["node"].values, stated, strict=True):
-            ax.annotate(plain_text(name), place, xytext=(6, 6), textcoords="offset points", fontsize=7, zorder=6)
+    name_places(ax, nodes["node"].values, stated)
     ax.set(xlabel="x in m", ylabel="y in m")
     return [
         Line2D([], [], marker="s", linestyle="", label="stated position", **style),
@@ -117,23 +109,25 @@ def _draw_direction(ax: Axes, tree: xr.DataTree, vector: pd.Series, width: float
     nodes = tree["constant_data"].to_dataset()
     scale = tree["bias"].to_dataset()["scale"].to_series()
     names, stated = nodes["node"].values.astype(str), nodes["node_position"].values[:, :2]
-    moved = {str(label): float(amount) for label, amount in (vector * scale).items()}
-    limits = {str(label): 0.3 * float(size) * float(vector.abs().max()) for label, size in scale.items()}
-    shift = np.array([[moved.get(f"{name}.position_{axis}", 0.0) for axis in "xy"] for name in names])
-    turn = np.array([moved.get(f"{name}.heading", 0.0) for name in names])
+    moved = vector * scale
+    shift = np.stack([moved.reindex(names + f".position_{axis}", fill_value=0.0) for axis in "xy"], 1)
+    turn = np.abs(moved.reindex(names + ".heading", fill_value=0.0).to_numpy())
     longest = np.linalg.norm(shift, axis=1).max()
     if longest > 0:
         arrows = shift / longest * REACH * width
         some = np.linalg.norm(arrows, axis=1) > 0.02 * REACH * width
-        (x, y), (u, v) = stated[some].T, arrows[some].T
-        ax.quiver(x, y, u, v, color=shade, angles="xy", scale_units="xy", scale=1.0, width=0.0035, zorder=4)
-    if np.abs(turn).max() > 0:
-        size = 60.0 * np.abs(turn) / np.abs(turn).max()
-        ax.scatter(stated[:, 0], stated[:, 1], s=size, marker="$\\circlearrowleft$", color=shade, zorder=4)
-    others = [label for label, amount in moved.items() if abs(amount) > limits[label]]
-    rest = [label for label in others if "position" not in label and "heading" not in label]
+        ax.quiver(
+            *stated[some].T, *arrows[some].T, color=shade, angles="xy", scale_units="xy", scale=1.0, width=0.0035,
+            zorder=4,
+        )  # fmt: skip
+    if turn.max() > 0:
+        ax.scatter(
+            stated[:, 0], stated[:, 1], s=60.0 * turn / turn.max(), marker="$\\circlearrowleft$", color=shade, zorder=4
+        )
+    large = vector.abs() > 0.3 * vector.abs().max()
+    rest = [label_parts(label) for label in vector.index[large] if "position" not in label and "heading" not in label]
     for name, place in zip(names, stated, strict=True):
-        mine = [label for label in rest if label_parts(label)[0] == name]
-        if mine and len(names) <= NAMED:
-            text = ", ".join(plain_text(label_parts(label)[1], 16) for label in mine[:2])
+        own = [bias for owner, bias in rest if owner == name]
+        if own and len(names) <= NAMED:
+            text = ", ".join(plain_text(bias, 16) for bias in own[:2])
             ax.annotate(text, place, xytext=(6, -10), textcoords="offset points", fontsize=6, color=shade, zorder=6)

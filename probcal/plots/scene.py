@@ -4,15 +4,16 @@ Of detections that nobody named also the objects found, and what each sensor see
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from probcal.errors import InputError
 from probcal.geodesy import GEODETIC, LocalFrame
-from probcal.labels import AXES, NODE
-from probcal.results.read import each_object, each_target
+from probcal.labels import AXES, NODE, coordinates
+from probcal.results.read import bias_values, each_object, each_target
 
 ARC = 48  # corners of a sector's arc
 SEEN = 0.5  # share of an object in view at which the outline of a view is drawn
@@ -32,14 +33,6 @@ class Track:
     sd: np.ndarray
     true: np.ndarray
 
-    def thin(self, most: int) -> "Track":
-        """At most `most` epochs, evenly spaced, both ends kept."""
-        if len(self.time) <= most:
-            return self
-        kept = np.linspace(0, len(self.time) - 1, most).round().astype(int)
-        parts = (self.time, self.before, self.after, self.sd, self.true)
-        return Track(self.target, *(part[kept] for part in parts))
-
 
 @dataclass(frozen=True)
 class Found:
@@ -50,12 +43,14 @@ class Found:
     position: np.ndarray
     existence: np.ndarray
 
-    def thin(self, most: int) -> "Found":
-        """At most `most` instants, evenly spaced, both ends kept."""
-        if len(self.time) <= most:
-            return self
-        kept = np.linspace(0, len(self.time) - 1, most).round().astype(int)
-        return Found(self.name, self.time[kept], self.position[kept], self.existence[kept])
+
+def thinned[T: (Track, Found)](whole: T, most: int) -> T:
+    """A track or object at `most` of its times, evenly spaced, both ends kept."""
+    if len(whole.time) <= most:
+        return whole
+    chosen = np.linspace(0, len(whole.time) - 1, most).round().astype(int)
+    parts = {name: values[chosen] for name, values in vars(whole).items() if np.ndim(values)}
+    return replace(whole, **parts)
 
 
 @dataclass(frozen=True)
@@ -110,11 +105,12 @@ def scene(tree: xr.DataTree) -> Scene:
     """Read the map of a fit; raises `InputError` for a tree that is none."""
     if not {"calibration", "constant_data"} <= set(tree.children):
         raise InputError("the map needs a result of fit(), with its groups calibration and constant_data")
-    nodes, tracks, mirrored = _places(tree), list(_tracks(tree)), list(_mirrored(tree))
+    nodes, tracks, alike = _places(tree), list(_tracks(tree)), _alike(tree)
+    mirrored = [] if alike is None else list(_mirrored(tree, alike))
+    elsewhere = np.empty((0, 2, nodes.stated.shape[1])) if alike is None else _elsewhere(alike, nodes)
     attrs = tree["constant_data"].attrs
     frame = LocalFrame(*(float(attrs[name]) for name in GEODETIC)) if GEODETIC[0] in attrs else None
     objects = [Found(name, *rest) for name, *rest in each_object(tree, AXES[: nodes.stated.shape[1]])]
-    elsewhere = _elsewhere(tree, nodes)
     low, high = _limits(nodes, [*tracks, *mirrored], diverged=tree.attrs.get("status") == "diverged")
     views = list(_views(tree, nodes, float(np.linalg.norm(high - low))))
     sure = [own.position[own.existence >= SURE] for own in objects]
@@ -131,28 +127,25 @@ def ellipse(covariance: np.ndarray, probability: float) -> tuple[float, float, f
     return float(width), float(height), float(np.arctan2(2 * xy, xx - yy) / 2)
 
 
-def shifts(tree: xr.DataTree) -> dict[str, float]:
-    """Value of every bias, estimated or fixed, by label."""
-    group, nodes = tree["calibration"].to_dataset(), tree["constant_data"].to_dataset()
-    found = dict(zip(group["bias_label"].values.tolist(), group["mean"].values.tolist(), strict=True))
-    if "fixed" in nodes:
-        found |= dict(zip(nodes["fixed_label"].values.tolist(), nodes["fixed"].values.tolist(), strict=True))
-    return found
+def _coordinates(names: np.ndarray, d: int) -> list[str]:
+    """Labels of the coordinates of all nodes, one node after the other."""
+    return [label for name in names for label in coordinates(of=name)[:d]]
 
 
 def _places(tree: xr.DataTree) -> Places:
-    group, nodes, moved = tree["calibration"].to_dataset(), tree["constant_data"].to_dataset(), shifts(tree)
-    names, stated = nodes["node"].values.astype(str), nodes["node_position"].values
-    labels = [[f"{name}.position_{axis}" for axis in AXES[: stated.shape[1]]] for name in names]
-    index = {label: k for k, label in enumerate(group["bias_label"].values.tolist())}
-    at = np.array([[index.get(label, -1) for label in own] for own in labels])
-    covariance = _of_places(group, at)
-    turned = [moved.get(f"{name}.heading", np.nan) for name in names]
+    group, nodes = tree["calibration"].to_dataset(), tree["constant_data"].to_dataset()
+    names, stated, moved = nodes["node"].values.astype(str), nodes["node_position"].values, pd.Series(bias_values(tree))
+    labels = _coordinates(names, stated.shape[1])
+    at = group.get_index("bias_label").get_indexer(pd.Index(labels)).reshape(stated.shape)
     return Places(
-        names, stated, stated + np.array([[moved.get(label, 0.0) for label in own] for own in labels]),
-        covariance, (at >= 0).any(1), nodes["moving"].values.astype(bool),
-        (nodes["node_heading"].values if "node_heading" in nodes else np.nan) + np.array(turned),
-    )  # fmt: skip
+        name=names,
+        stated=stated,
+        calibrated=stated + moved.reindex(labels, fill_value=0.0).to_numpy().reshape(stated.shape),
+        covariance=_of_places(group, at),
+        free=(at >= 0).any(1),
+        moving=nodes["moving"].values.astype(bool),
+        heading=nodes["node_heading"].values + moved.reindex(names + ".heading").to_numpy(),
+    )
 
 
 def _of_places(group: xr.Dataset, at: np.ndarray) -> np.ndarray:
@@ -169,71 +162,66 @@ def _of_places(group: xr.Dataset, at: np.ndarray) -> np.ndarray:
 def _tracks(tree: xr.DataTree) -> Iterator[Track]:
     """Positions of every target that has some."""
     for target, group in each_target(tree):
-        axes = [f"position_{axis}" for axis in AXES if f"position_{axis}" in group["component"].values]
+        axes = coordinates(group["component"].values)
         if len(axes) > 1:
             part = group.sel(component=axes)
-            after = part["mean"].values
-            true = part["true"].values if "true" in part else np.full(after.shape, np.nan)
-            yield Track(target, group["time"].values, part["before"].values, after, part["sd"].values, true)
+            true = part["true"] if "true" in part else xr.full_like(part["mean"], np.nan)
+            places = (part["before"], part["mean"], part["sd"], true)
+            yield Track(target, group["time"].values, *(own.values for own in places))
 
 
-def _alike(tree: xr.DataTree) -> xr.Dataset:
-    """Answers that fit as well, without their tracks; none where there is no group of them."""
+def _alike(tree: xr.DataTree) -> xr.Dataset | None:
+    """Answers that fit as well, without their tracks, with their numbers; None where there is none."""
     if "mirror" not in tree.children:
-        return xr.Dataset({"gain": ("mirror", np.zeros(0))})
+        return None
     group = tree["mirror"].to_dataset()
-    return group.assign(number=("mirror", np.arange(group.sizes["mirror"]))).isel(
-        mirror=group["gain"].values > -group.attrs["same"]
-    )
+    group = group.assign(number=("mirror", np.arange(group.sizes["mirror"])))
+    return group.isel(mirror=group["gain"].values > -group.attrs["same"])
 
 
-def _mirrored(tree: xr.DataTree) -> Iterator[Track]:
+def _mirrored(tree: xr.DataTree, alike: xr.Dataset) -> Iterator[Track]:
     """Tracks of the best answer on the other side of a mirror, where one fits as well."""
-    alike = _alike(tree)
-    if alike.sizes["mirror"] and "kind" in alike:
-        alike = alike.isel(mirror=alike["kind"].values != NODE)
-    if not alike.sizes["mirror"]:
-        return
-    best = int(alike["number"].values[alike["gain"].values.argmax()])
-    for target, there in each_target(tree.children["mirror"]):
-        places = there["position"].isel(mirror=best).values
-        nothing = np.full(places.shape, np.nan)
-        yield Track(target, there["time"].values, places, places, nothing, nothing)
+    others = alike.isel(mirror=alike["kind"].values != NODE)
+    if others.sizes["mirror"]:
+        best = int(others["number"].values[others["gain"].values.argmax()])
+        for target, group in each_target(tree.children["mirror"]):
+            places = group["position"].isel(mirror=best).values
+            unknown = np.full(places.shape, np.nan)
+            yield Track(target, group["time"].values, places, places, unknown, unknown)
 
 
-def _elsewhere(tree: xr.DataTree, nodes: Places) -> np.ndarray:
+def _elsewhere(alike: xr.Dataset, nodes: Places) -> np.ndarray:
     """Where nodes were found and where they stand in answers that fit as well (K, 2, d), if that is another place."""
-    alike, d = _alike(tree), nodes.stated.shape[1]
-    found = list[np.ndarray]()
-    label = {name: k for k, name in enumerate(alike["bias_label"].values.tolist())} if len(alike.coords) else {}
-    at = np.array([[label.get(f"{name}.position_{axis}", -1) for axis in AXES[:d]] for name in nodes.name.tolist()])
-    for own in range(alike.sizes["mirror"]):
-        bias, apart = (np.append(alike[name].values[own], 0.0) for name in ("bias", "apart"))
-        for k in np.flatnonzero(apart[at].max(1) > BEYOND):
-            there = np.where(at[k] >= 0, nodes.stated[k] + bias[at[k]], nodes.calibrated[k])
-            found.append(np.stack([nodes.calibrated[k], there]))
-    return np.array(found).reshape(-1, 2, d)
+    d, found = nodes.stated.shape[1], list[np.ndarray]()
+    at = alike.get_index("bias_label").get_indexer(pd.Index(_coordinates(nodes.name, d))).reshape(-1, d)
+    for bias, apart in zip(alike["bias"].values, alike["apart"].values, strict=True):
+        there = np.where(at >= 0, nodes.stated + bias[at], nodes.calibrated)
+        other = np.where(at >= 0, apart[at], 0.0).max(1) > BEYOND
+        found.append(np.stack([nodes.calibrated, there], 1)[other])
+    return np.concatenate([np.empty((0, 2, d)), *found])
 
 
 def _views(tree: xr.DataTree, nodes: Places, far: float) -> Iterator[Outline]:
     """What each sensor sees from its calibrated node, in the plane; a view without an end ends `far` m away."""
-    group, moved = tree["constant_data"].to_dataset(), shifts(tree)
+    group = tree["constant_data"].to_dataset()
     if "view_range" not in group:
         return
-    on = list(zip(group["placed_sensor"].values.tolist(), group["placed_node"].values.tolist(), strict=True))
-    names, at = nodes.name.tolist(), {}
-    for sensor, node in on:
-        at[sensor] = names.index(node) if [own for own, _ in on].count(sensor) == 1 else -1
-    parts = (group[f"view_{part}"].values.tolist() for part in ("range", "width", "towards"))
-    for sensor, reach, width, towards in zip(group["sensor"].values.tolist(), *parts, strict=True):
-        k, round_ = at.get(sensor, -1), width >= 2 * np.pi - 1e-6
-        if k < 0 or np.isnan(reach) or (round_ and np.isinf(reach)) or (nodes.moving[k] and not round_):
+    turned, names = pd.Series(bias_values(tree)), nodes.name.tolist()
+    placed = pd.Series(group["placed_node"].values, group["placed_sensor"].values)
+    placed = placed[~placed.index.duplicated(keep=False)]  # a sensor of several nodes has no one view
+    sectors = group[["view_range", "view_width", "view_towards"]].to_dataframe().dropna(subset="view_range")
+    for sensor, reach, width, towards in sectors.itertuples(name=None):
+        round_ = width >= 2 * np.pi - 1e-6
+        if sensor not in placed or (round_ and np.isinf(reach)):
             continue
-        turned = float(group["node_heading"].values[k]) + moved.get(f"{names[k]}.heading", 0.0) + towards
-        angle = turned + width * np.linspace(-0.5, 0.5, ARC)
-        arc = nodes.calibrated[k, :2] + min(reach, far) * np.stack([np.cos(angle), np.sin(angle)], 1)
-        corner = np.empty((0, 2)) if round_ else nodes.calibrated[k, :2][None]
-        yield Outline(sensor, [np.concatenate([corner, arc, corner])], whole=True)
+        k = names.index(placed[sensor])
+        if nodes.moving[k] and not round_:
+            continue
+        heading = float(group["node_heading"][k]) + turned.get(f"{names[k]}.heading", 0.0)
+        angle = heading + towards + width * np.linspace(-0.5, 0.5, ARC)
+        place = nodes.calibrated[k, :2]
+        arc = place + min(reach, far) * np.stack([np.cos(angle), np.sin(angle)], 1)
+        yield Outline(sensor, [arc if round_ else np.concatenate([[place], arc, [place]])], whole=True)
     if "view" in group:
         from contourpy import contour_generator  # what both libraries of pictures draw with
 
@@ -247,14 +235,13 @@ def _widened(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Corners that hold objects and views too, as far as they lie beside what is there."""
     aside = ASIDE * float((high - low).max())
-    low, high = low.copy(), high.copy()
     near, far = low - aside, high + aside
+    low, high = low.copy(), high.copy()
     for points in (*objects, *views):
-        some = points[np.isfinite(points).all(1)]
-        if len(some):
-            d = some.shape[1]
-            low[:d] = np.minimum(low[:d], np.maximum(some.min(0), near[:d]))
-            high[:d] = np.maximum(high[:d], np.minimum(some.max(0), far[:d]))
+        d = points.shape[1]
+        some = np.clip(points[np.isfinite(points).all(1)], near[:d], far[:d])
+        low[:d] = np.minimum(low[:d], some.min(0, initial=np.inf))
+        high[:d] = np.maximum(high[:d], some.max(0, initial=-np.inf))
     return low, high
 
 

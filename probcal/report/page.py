@@ -3,13 +3,13 @@
 import base64
 import io
 import json
-from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import jinja2
 import matplotlib
+import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
@@ -24,6 +24,23 @@ from probcal.status import INVALID, Status
 
 COLOURS = {str(s): "good" if s.settled else "warn" if s.valid else "bad" for s in Status}
 HERE = Path(__file__).parent
+# title of a picture -> what it shows, groups of a tree that it needs, outlying data or drifts, and what draws it
+PICTURES = {
+    "Map": ("Nodes and tracks before and after calibration", {"constant_data", "track"}, "plot_map"),
+    "Estimates": ("Mean and interval of every bias in units of its scale", {"calibration"}, "plot_biases"),
+    "Drift": ("Values of the drifting biases over time with their intervals", {"posterior", "drifts"}, "plot_drift"),
+    "Residuals": ("Histograms of the residuals before and after calibration", {"residual"}, "plot_residuals"),
+    "Residuals over time": (
+        "Residuals over time, those that count less than half marked", {"residual", "outliers"}, "plot_outliers"),
+    "Objective": ("Objective over the iterations", {"optimisation"}, "plot_objective"),
+    "Objects": (
+        "Existence of every object that nobody named over time, and how many there are", {"object"}, "plot_objects"),
+    "Verdicts": (
+        "Gamma of every bias against how much the data narrow it, coloured by verdict", {"verdict"}, "plot_shrinkage"),
+    "Innovations": ("NIS of every epoch with its limits", {"epoch_check"}, "plot_nis"),
+    "Sensors left out": ("Gain by calibration of each sensor, judged by the rest", {"sensor_check"}, "plot_left_out"),
+    "Halves": ("Change of every bias from the first half to the second", {"halves"}, "plot_halves"),
+}  # fmt: skip
 
 
 def write_report(tree: xr.DataTree, path: str | PathLike[str], *, static: bool = False) -> Path:
@@ -110,44 +127,21 @@ def _versions(attrs: dict[str, Any]) -> str:
 
 def _pictures(tree: xr.DataTree, light: tuple[str, ...]) -> list[dict[str, str]]:
     """Pictures of what the tree holds, as data addresses; those that are to be light by pixels."""
-    found: list[tuple[str, str, set[str], Callable[[], Axes]]] = [
-        ("Map", "Nodes and tracks before and after calibration", {"constant_data", "track"},
-         lambda: plots.plot_map(tree)),
-        ("Estimates", "Mean and interval of every bias in units of its scale", {"calibration"},
-         lambda: plots.plot_biases(tree)),
-        ("Residuals", "Histograms of the residuals before and after calibration", {"residual"},
-         lambda: plots.plot_residuals(tree)[0]),
-        ("Objective", "Objective over the iterations", {"optimisation"},
-         lambda: plots.plot_objective(tree)),
-    ]  # fmt: skip
-    if tables.weighted(tree):
-        text = "Residuals over time, those that count less than half marked"
-        found.insert(3, ("Residuals over time", text, {"residual"}, lambda: plots.plot_outliers(tree)))
-    if len(drift_table(tree)):
-        text = "Values of the drifting biases over time with their intervals"
-        found.insert(2, ("Drift", text, {"posterior"}, lambda: plots.plot_drift(tree)))
-    found += [
-        ("Objects", "Existence of every object that nobody named over time, and how many there are", {"object"},
-         lambda: plots.plot_objects(tree)[0]),
-        ("Verdicts", "Gamma of every bias against how much the data narrow it, coloured by verdict", {"verdict"},
-         lambda: plots.plot_shrinkage(tree)),
-        ("Innovations", "NIS of every epoch with its limits", {"epoch_check"},
-         lambda: plots.plot_nis(tree)),
-        ("Sensors left out", "Gain by calibration of each sensor, judged by the rest", {"sensor_check"},
-         lambda: plots.plot_left_out(tree)),
-        ("Halves", "Change of every bias from the first half to the second", {"halves"},
-         lambda: plots.plot_halves(tree)),
-    ]  # fmt: skip
     present = set(tree.children)
+    if tables.weighted(tree):
+        present.add("outliers")
+    if len(drift_table(tree)):
+        present.add("drifts")
     return [
-        {"title": title, "alt": alt, "source": _embed(draw(), "png" if title in light else "svg")}
-        for title, alt, needs, draw in found
+        {"title": title, "alt": alt, "source": _embed(getattr(plots, draw)(tree), "png" if title in light else "svg")}
+        for title, (alt, needs, draw) in PICTURES.items()
         if needs <= present
     ]
 
 
-def _embed(ax: Axes, kind: str) -> str:
+def _embed(drawn: Axes | list[Axes], kind: str) -> str:
     """The figure of these axes in a data address, the same for the same tree."""
+    ax = np.atleast_1d(np.array(drawn, object))[0]
     sheet = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "probcal"}):
         metadata = {"Date": None} if kind == "svg" else {"Software": None}

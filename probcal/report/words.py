@@ -1,13 +1,15 @@
 """Numbers and sentences of a report: what a fit found, in words."""
 
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from markupsafe import Markup, escape
 
+from probcal.results.read import known_truth, summary
 from probcal.status import INVALID, Status
 
 NONE = "–"  # where there is no finite number
@@ -29,6 +31,11 @@ class Row(NamedTuple):
 def number(value: float, digits: int = 3) -> str:
     """A number of so many significant digits, or a dash."""
     return f"{float(value):.{digits}g}" if np.isfinite(value) else NONE
+
+
+def fixed(value: float, places: int) -> str:
+    """A number with so many places, or a dash."""
+    return f"{value:.{places}f}" if np.isfinite(value) else NONE
 
 
 def rounded(value: float, sd: float) -> str:
@@ -65,110 +72,93 @@ def headline(tree: xr.DataTree) -> str:
     status = Status(ended)
     if not status.settled:
         return f"The fit {status.said}." if not status.valid else f"The fit {status.said}: its numbers are no answer."
-    group = tree["calibration"].to_dataset()
-    away, total = np.flatnonzero(_away(group)), group.sizes["bias_label"]
-    told = "no bias differs from zero"
+    frame, told = bias_frame(tree), "no bias differs from zero"
+    away = frame[frame["away"]]
     if len(away):
-        most = away[np.argmax(np.abs(group["mean"].values / group["sd"].values)[away])]
+        most = away["far"].idxmax()
         verb = "differs" if len(away) == 1 else "differ"
-        told = f"{len(away)} of {total} biases {verb} from zero, most clearly {group['bias_label'].values[most]} at "
-        told += _value(group, int(most))
+        told = f"{len(away)} of {len(frame)} biases {verb} from zero, most clearly {most} at {away['value'][most]}"
     return f"The fit {status.said}: {told}{_judged(tree)}."
+
+
+def _verdicts(tree: xr.DataTree) -> list[str]:
+    """Verdict of every bias; empty where the fit was not assessed."""
+    return tree["verdict"].to_dataset()["verdict"].values.tolist() if "verdict" in tree.children else []
 
 
 def _judged(tree: xr.DataTree) -> str:
     """How many biases have which verdict."""
-    if "verdict" not in tree.children:
-        return ""
-    verdicts = tree["verdict"].to_dataset()["verdict"].values.tolist()
-    counts = {name: verdicts.count(name) for name in ("determined", *ASIDE, "weak", "prior only")}
-    return "; " + ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+    count = Counter(_verdicts(tree))
+    told = [f"{count[name]} {name}" for name in ("determined", *ASIDE, "weak", "prior only") if count[name]]
+    return f"; {', '.join(told)}" if told else ""
 
 
 def nothing_found(tree: xr.DataTree) -> str:
     """What it means that no bias is shown: how many the data tell of, or that nobody asked."""
-    if "verdict" not in tree.children:
-        return "; the fit was not assessed"
-    verdicts = tree["verdict"].to_dataset()["verdict"].values
-    told = int((verdicts == "determined").sum())
-    return f"; the data determine {told} of {len(verdicts)}"
+    verdicts = _verdicts(tree)
+    told = f"the data determine {verdicts.count('determined')} of {len(verdicts)}"
+    return f"; {told if verdicts else 'the fit was not assessed'}"
 
 
 def in_conflict(tree: xr.DataTree) -> bool:
     """Whether some bias conflicts with the model or drifts."""
-    return "verdict" in tree.children and bool(np.isin(tree["verdict"].to_dataset()["verdict"].values, ASIDE).any())
+    return not set(ASIDE).isdisjoint(_verdicts(tree))
 
 
-def _away(group: xr.Dataset) -> np.ndarray:
-    """Which intervals leave zero out, (M,) bool."""
-    return (group["lower"].values > 0) | (group["upper"].values < 0)
+def bias_frame(tree: xr.DataTree) -> Any:
+    """One row a bias: its summary, true value and value as text, how many sd it is from zero, whether surely.
 
-
-def _value(group: xr.Dataset, k: int) -> str:
-    """Mean ± sd of bias k with its unit."""
-    mean, sd, grain = float(group["mean"].values[k]), float(group["sd"].values[k]), _grain(group, k)
-    return with_unit(f"{rounded(mean, grain)} ± {rounded(sd, grain)}", str(group["unit"].values[k]))
-
-
-def _grain(group: xr.Dataset, k: int) -> float:
-    """What the digits of bias k follow: its sd, but nothing finer than a thousandth of its scale."""
-    return max(float(group["sd"].values[k]), 1e-3 * float(group["scale"].values[k]))
+    Verdict and reason are empty where the fit was not assessed.
+    """
+    frame = summary(tree).set_index("bias").assign(true=known_truth(tree))
+    frame["far"] = (frame["mean"] / frame["sd"]).abs().fillna(np.inf)
+    frame["away"] = (frame["lower"] > 0) | (frame["upper"] < 0)
+    frame["grain"] = np.maximum(frame["sd"], 1e-3 * frame["scale"])  # digits finer than that say nothing
+    for name in ("mean", "sd", "lower", "upper", "true"):
+        pairs = zip(frame[name], frame["grain"], strict=True)
+        frame[f"{name}_text"] = [rounded(value, grain) for value, grain in pairs]
+    values = frame["mean_text"] + " ± " + frame["sd_text"]
+    frame["value"] = [with_unit(value, unit) for value, unit in zip(values, frame["unit"], strict=True)]
+    return frame.assign(**{name: "" for name in ("verdict", "reason") if name not in frame})
 
 
 def that_matter(tree: xr.DataTree) -> tuple[list[Row], int]:
     """Biases in conflict or invalid, then those away from zero, then the weak ones; and how many are left out."""
-    group = tree["calibration"].to_dataset()
-    count = group.sizes["bias_label"]
-    judged = tree["verdict"].to_dataset() if "verdict" in tree.children else None
-    verdicts = judged["verdict"].values.tolist() if judged is not None else [""] * count
-    reasons = judged["reason"].values.tolist() if judged is not None else [""] * count
-    status = group["status"].values.tolist()
-    with np.errstate(invalid="ignore", divide="ignore"):
-        far = np.nan_to_num(np.abs(group["mean"].values / group["sd"].values), nan=np.inf)
-    rank = np.full(count, 3)
-    rank[[verdict == "weak" and one != "pruned" for verdict, one in zip(verdicts, status, strict=True)]] = 2
-    rank[_away(group)] = 1
-    rank[[v in ASIDE or s in INVALID for v, s in zip(verdicts, status, strict=True)]] = 0
-    order = [k for k in np.lexsort((-far, rank)).tolist() if rank[k] < 3]
-    true = true_values(tree)
-    rows = []
-    for k in order[:MATTER]:
-        label, unit, grain = str(group["bias_label"].values[k]), str(group["unit"].values[k]), _grain(group, k)
-        lower, upper = (rounded(float(group[name].values[k]), grain) for name in ("lower", "upper"))
-        known = with_unit(rounded(true[label], grain), unit) if label in true else ""
-        verdict = status[k] if status[k] in INVALID else verdicts[k]
-        rows.append(Row(label, _value(group, k), f"{lower} to {upper}", verdict, reasons[k], known))
-    said = said_once([row.label for row in rows], [row.reason for row in rows])
-    rows = [row._replace(reason=reason) for row, reason in zip(rows, said, strict=True)]
-    return rows, len(order) - len(rows)
+    frame = bias_frame(tree)
+    invalid = frame["status"].isin(INVALID)
+    weak = (frame["verdict"] == "weak") & (frame["status"] != "pruned")
+    frame["rank"] = np.select([frame["verdict"].isin(ASIDE) | invalid, frame["away"], weak], [0, 1, 2], 3)
+    frame["verdict"] = frame["verdict"].mask(invalid, frame["status"])
+    order = np.lexsort((-frame["far"], frame["rank"]))
+    chosen = frame.iloc[order][lambda own: own["rank"] < 3]
+    shown = chosen[:MATTER]
+    reasons = said_once(shown.index, shown["reason"])
+    rows = [
+        Row(
+            label=one.Index,
+            value=one.value,
+            interval=f"{one.lower_text} to {one.upper_text}",
+            verdict=one.verdict,
+            reason=reason,
+            true=with_unit(one.true_text, one.unit) if np.isfinite(one.true) else "",
+        )
+        for one, reason in zip(shown.itertuples(), reasons, strict=True)
+    ]
+    return rows, len(chosen) - len(rows)
 
 
-def said_once(labels: Sequence[str], reasons: Sequence[str]) -> list[str]:
+def said_once(labels: Iterable[str], reasons: Iterable[str]) -> list[str]:
     """Every reason in full where it stands first; where it stands again, the bias that has it."""
     first: dict[str, str] = {}
-    owners = [first.setdefault(reason, label) for label, reason in zip(labels, reasons, strict=True)]
-    return [
-        reason if owner == label or not reason else f"as {owner}"
-        for label, reason, owner in zip(labels, reasons, owners, strict=True)
-    ]
-
-
-def true_values(tree: xr.DataTree) -> dict[str, float]:
-    """True biases by label, none where they are not known."""
-    if "truth" not in tree.children:
-        return {}
-    return {str(label): float(value) for label, value in tree["truth"].to_dataset()["bias"].to_series().items()}
+    owners = [(first.setdefault(reason, label), label, reason) for label, reason in zip(labels, reasons, strict=True)]
+    return [reason if owner == label or not reason else f"as {owner}" for owner, label, reason in owners]
 
 
 def position_errors(attrs: dict[str, Any]) -> str:
     """The sentence on the position error before and after, and how the answer was laid on the truth."""
-    for suffix, how in (
-        ("", ""),
-        ("_rigid", ", laid on the truth as a rigid body"),
-        ("_similarity", ", as a similarity"),
-    ):
-        names = [f"position_rmse_{when}{suffix}" for when in ("before", "after")]
-        if all(name in attrs for name in names):
-            before, after = (number(attrs[name]) for name in names)
+    laid = {"": "", "_rigid": ", laid on the truth as a rigid body", "_similarity": ", as a similarity"}
+    for suffix, how in laid.items():
+        if f"position_rmse_after{suffix}" in attrs:
+            before, after = (number(attrs[f"position_rmse_{when}{suffix}"]) for when in ("before", "after"))
             return f"Position error (RMSE) {before} m before calibration, {after} m after{how}."
     return ""

@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from probcal.errors import InputError
-
-if TYPE_CHECKING:
-    from scipy.spatial import transform
-else:
-    from probcal.lazy import Later
-
-    transform = Later("scipy.spatial.transform")
+from probcal.linalg import nearest_rotation
 
 KINDS = ("rigid", "similarity")
 
@@ -60,13 +54,6 @@ def align(places: Any, truth: Any, kind: str) -> Alignment:
     if len(np.unique(a, axis=0)) < a.shape[1] or not (np.isfinite(a).all() and np.isfinite(b).all()):
         raise InputError(f"align: at least {a.shape[1]} different finite places are needed in {a.shape[1]}-D")
     from_mean, to_mean = a - a.mean(0), b - b.mean(0)
-    if a.shape[1] == 2:
-        across = np.sum(from_mean[:, 0] * to_mean[:, 1] - from_mean[:, 1] * to_mean[:, 0])
-        angle = np.arctan2(across, np.sum(from_mean * to_mean))
-        rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    else:
-        rotation = transform.Rotation.align_vectors(to_mean, from_mean)[0].as_matrix()
-    scale = 1.0
-    if kind == "similarity":
-        scale = float(np.sum(to_mean * (from_mean @ rotation.T)) / np.sum(from_mean**2))
+    rotation, _ = nearest_rotation(to_mean.T @ from_mean)
+    scale = float(np.sum(to_mean * (from_mean @ rotation.T)) / np.sum(from_mean**2)) if kind == "similarity" else 1.0
     return Alignment(kind, rotation, b.mean(0) - scale * rotation @ a.mean(0), scale)

@@ -10,6 +10,7 @@ import pandas as pd
 from probcal.errors import checked
 from probcal.labels import step_of
 from probcal.results.blocks import SensorBlocks
+from probcal.results.schema import held_biases
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -28,31 +29,24 @@ def drift_table(tree: xr.DataTree) -> pd.DataFrame:
     columns = ["bias", "unit", "since", "mean", "sd", "lower", "upper"]
     if not {"calibration", "posterior"} <= set(tree.children):
         return pd.DataFrame(columns=columns)
-    group, draws = tree["calibration"].to_dataset(), tree["posterior"].to_dataset()["bias"].values
-    labels = group["bias_label"].values.astype(str).tolist()
-    constant = tree["constant_data"].to_dataset()
-    fixed = {str(k): float(v) for k, v in constant["fixed"].to_series().items()} if "fixed" in constant else {}
-    every = [*labels, *fixed]
-    units = dict(zip(labels, group["unit"].values, strict=True))
-    mean = group["mean"].values
+    group, draws = tree["calibration"].to_dataset(), tree["posterior"].to_dataset()["bias"]
+    free, fixed = group["unit"].to_series(), held_biases(tree)
+    every = [*free.index, *fixed]
     start = float(tree["observed_data"].to_dataset()["time"].min())
     tail = (1 - tree.attrs["interval_probability"]) / 2
     steps: dict[str, list[tuple[float, str]]] = {}
     for label in every:
-        step = step_of(label, every)
-        if step is not None:
+        if (step := step_of(label, every)) is not None:
             steps.setdefault(step[0], []).append((step[1], label))
     table = []
     for name, own in steps.items():
-        known = [label for label in (name, *(label for _, label in own)) if label in units]
-        if not known:
-            continue
-        for since in sorted({max(time, start) for time, _ in own} | {start}):
+        units = [free[label] for label in (name, *(label for _, label in own)) if label in free]
+        for since in sorted({max(time, start) for time, _ in own} | {start}) if units else ():
             so_far = [name, *(label for time, label in own if time <= since)]
-            names = [label for label in so_far if label in units]
-            members = [labels.index(label) for label in names]
+            names = [label for label in so_far if label in free]
             held = sum(fixed.get(label, 0.0) for label in so_far)
-            lower, upper = held + np.quantile(draws[..., members].sum(-1), [tail, 1 - tail])
+            mean = held + float(group["mean"].sel(bias_label=names).sum())
+            lower, upper = held + draws.sel(bias_label=names).sum("bias_label").quantile([tail, 1 - tail]).values
             sd = np.sqrt(SensorBlocks.read(group, names, "drift_table").matrix().sum())
-            table.append((name, units[known[0]], since, held + mean[members].sum(), sd, lower, upper))
+            table.append((name, units[0], since, mean, sd, lower, upper))
     return pd.DataFrame(table, columns=columns)

@@ -42,13 +42,8 @@ def bias_coords(problem: Problem, chosen: Any = None) -> dict[str, Any]:
     if chosen is not None:
         index = np.asarray(chosen)
         biases = [biases[m] for m in (np.flatnonzero(index) if index.dtype == bool else index)]
-    columns = {
-        "owner": [b.owner for b in biases],
-        "component": [b.component for b in biases],
-        "axis": [AXES[b.axis] if b.vector else "" for b in biases],
-        "sensor_type": [b.sensor_type for b in biases],
-        "unit": [b.unit for b in biases],
-    }
+    columns = {name: [getattr(b, name) for b in biases] for name in ("owner", "component", "sensor_type", "unit")}
+    columns["axis"] = [AXES[b.axis] if b.vector else "" for b in biases]
     found: dict[str, Any] = {name: ("bias_label", np.array(values, str)) for name, values in columns.items()}
     first = float(problem.measurements.time.min())
     since = np.array([first if b.since is None else b.since for b in biases], float)
@@ -84,12 +79,9 @@ def gather(parts: Sequence[np.ndarray], picks: list[tuple[np.ndarray, np.ndarray
 
 def direction_group(labels: Sequence[str], directions: Sequence[Any]) -> xr.Dataset:
     """Directions that the data do not fix: what moves, how weakly it is known, and the remedy."""
-    texts = {name: [getattr(d, name) for d in directions] for name in ("sentence", "words", "kind", "remedy")}
-    columns = texts | {
-        "information": [d.information for d in directions],
-        "share": [d.share for d in directions],
-        "fix": [" ".join(d.fix) for d in directions],
-    }
+    names = ("sentence", "words", "kind", "remedy", "information", "share")
+    columns = {name: [getattr(d, name) for d in directions] for name in names}
+    columns["fix"] = [" ".join(d.fix) for d in directions]
     group = xr.Dataset({name: ("direction", values) for name, values in columns.items()})
     vectors = (("direction", "bias_label"), np.stack([d.vector for d in directions]))
     return group.assign(vector=vectors).assign_coords(direction=[d.name for d in directions], bias_label=list(labels))

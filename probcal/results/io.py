@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -123,48 +123,52 @@ def _sealed(path: Path) -> bool:
 
 def check_content(tree: xr.DataTree, path: Path) -> None:
     """Raise `InputError` where a fit lacks what its readers need, or holds what no fit can hold."""
+    for fault in _faults(tree):
+        raise InputError(f"{path}{fault}")
+
+
+def _faults(tree: xr.DataTree) -> Iterator[str]:
+    """What a fit lacks, or holds and no fit can hold, as a sentence goes on after the name of its file."""
     if "calibration" not in tree.children or not set(SUMMARY[1:]) <= set(tree["calibration"].variables):
-        raise InputError(f"{path} is not a fit written by probcal: its group calibration is missing or incomplete")
+        yield " is not a fit written by probcal: its group calibration is missing or incomplete"
     if (found := tree.attrs.get("results_version")) != RESULTS_VERSION:
         age = "a newer" if isinstance(found, (int, np.integer)) and found > RESULTS_VERSION else "an older"
-        raise InputError(f"{path} was written by {age} probcal; fit again")
+        yield f" was written by {age} probcal; fit again"
     tracks = list(tree["track"].children.values()) if "track" in tree.children else []
     if not tracks or any("target" not in node.attrs for node in tracks):
-        raise InputError(f"{path} is incomplete: its group track lacks what a fit holds; fit again")
+        yield " is incomplete: its group track lacks what a fit holds; fit again"
     judged = {group: members for group, members in JUDGED.items() if group in tree.children}
     expected = [*NEEDED.items(), ("calibration", BLOCKS if "block" in tree["calibration"] else WHOLE), *judged.items()]
     parts = [(group, tree.children.get(group), members) for group, members in expected]
     for name, node, members in [*parts, *((f"track/{node.name}", node, TRACKED) for node in tracks)]:
         if node is None or not set(members) <= set(node.variables):
-            group = name.partition("/")[0]
-            raise InputError(f"{path} is incomplete: its group {group} lacks what a fit holds; fit again")
-        _check_members(node, members, f"{path}: {name}")
-    if missing := [name for name in ATTRIBUTES if name not in tree.attrs]:
-        raise InputError(f"{path} is incomplete: it has no attribute {missing[0]}; fit again")
+            yield f" is incomplete: its group {name.partition('/')[0]} lacks what a fit holds; fit again"
+        else:
+            yield from (f": {name}/{fault}; the file was changed, fit again" for fault in _unlike(node, members))
+    for name in ATTRIBUTES:
+        if name not in tree.attrs:
+            yield f" is incomplete: it has no attribute {name}; fit again"
     if (status := tree.attrs["status"]) not in set(Status):
-        raise InputError(f'{path}: its attribute status is "{status}", which no fit has; fit again')
+        yield f': its attribute status is "{status}", which no fit has; fit again'
     if not 0.0 < float(tree.attrs["interval_probability"]) < 1.0:
-        raise InputError(f"{path}: its attribute interval_probability does not lie between 0 and 1; fit again")
-    _check_moments(tree, path)
+        yield ": its attribute interval_probability does not lie between 0 and 1; fit again"
+    yield from (f": {fault}; the file was changed, fit again" for fault in _wrong_moments(tree))
 
 
-def _check_members(node: xr.DataTree, members: Mapping[str, Member], where: str) -> None:
-    """Raise `InputError` where a variable has other dimensions, another kind of values, or numbers
-    out of range."""
+def _unlike(node: xr.DataTree, members: Mapping[str, Member]) -> Iterator[str]:
+    """The variables that have other dimensions, another kind of values, or numbers out of range."""
     for name, member in members.items():
         variable = node.variables[name]
-        values, fault = variable.values, ""
+        values = variable.values
         if variable.dims != member.dims:
-            fault = f"has the dimensions {variable.dims} in place of {member.dims}"
+            yield f"{name} has the dimensions {variable.dims} in place of {member.dims}"
         elif values.size and member.kind not in ("any", _kind_of(values)):
-            fault = f"holds no {member.kind}"
+            yield f"{name} holds no {member.kind}"
         elif member.kind == "numbers":
             away = (values < member.least - ROUNDING) | (values > member.most + ROUNDING)
             away |= member.finite & ~np.isfinite(values)
             if away.any():
-                fault = f"holds {values[away].flat[0]:g}, which no fit can have"
-        if fault:
-            raise InputError(f"{where}/{name} {fault}; the file was changed, fit again")
+                yield f"{name} holds {values[away].flat[0]:g}, which no fit can have"
 
 
 def _kind_of(values: np.ndarray) -> str:
@@ -174,26 +178,24 @@ def _kind_of(values: np.ndarray) -> str:
     return {"U": "texts", "b": "flags"}.get(values.dtype.kind, "numbers" if values.dtype.kind in "iuf" else "objects")
 
 
-def _check_moments(tree: xr.DataTree, path: Path) -> None:
-    """Raise `InputError` for labels that differ or repeat, intervals upside down, and covariances
-    that are none."""
+def _wrong_moments(tree: xr.DataTree) -> Iterator[str]:
+    """Labels that differ or repeat, intervals upside down, and covariances that are none."""
     group, draws = tree["calibration"].to_dataset(), tree["posterior"].to_dataset()
+    blocks = "block" in group
     labels, others = group["bias_label"].values.tolist(), [draws["bias_label"].values.tolist()]
-    others += [] if "block" in group else [group["bias_label_other"].values.tolist()]
+    others += [] if blocks else [group["bias_label_other"].values.tolist()]
     if len(set(labels)) < len(labels) or any(other != labels for other in others):
-        raise InputError(f"{path}: its biases have labels that differ or repeat; the file was changed, fit again")
+        yield "its biases have labels that differ or repeat"
     upside = np.flatnonzero(group["lower"].values > group["upper"].values)
     if len(upside):
-        raise InputError(
-            f"{path}: calibration/lower of {labels[upside[0]]} lies above its upper; the file was changed, fit again"
-        )
-    name = "block_covariance" if "block" in group else "covariance"
+        yield f"calibration/lower of {labels[upside[0]]} lies above its upper"
     try:
-        spread = SensorBlocks.read(group, labels, str(path))
+        semi_definite = _semi_definite(SensorBlocks.read(group, labels, "load").covariance)
     except (IndexError, ValueError):
-        raise InputError(f"{path}: calibration/block names no block; the file was changed, fit again") from None
-    if not _semi_definite(spread.covariance):
-        raise InputError(f"{path}: calibration/{name} is no covariance matrix; the file was changed, fit again")
+        yield "calibration/block names no block"
+    else:
+        if not semi_definite:
+            yield f"calibration/{'block_covariance' if blocks else 'covariance'} is no covariance matrix"
 
 
 def _semi_definite(matrices: np.ndarray) -> bool:

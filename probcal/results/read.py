@@ -13,7 +13,7 @@ import numpy as np
 from probcal.errors import InputError, checked
 from probcal.labels import NOBODY
 from probcal.results.blocks import SensorBlocks
-from probcal.results.schema import MORE, SUMMARY
+from probcal.results.schema import MORE, SUMMARY, held_biases
 from probcal.status import INVALID
 
 if TYPE_CHECKING:
@@ -40,6 +40,20 @@ def summary(tree: xr.DataTree) -> Any:
         group, columns = group.assign(judged.data_vars), [*columns, *judged.data_vars]
     frame = group[columns[1:]].to_dataframe().reset_index()
     return frame.rename(columns={"bias_label": "bias"})[columns]
+
+
+def frame_of(tree: xr.DataTree, group: str, *columns: str) -> Any:
+    """The variables and coordinates of a group as a DataFrame, or some of them in this order."""
+    data, chosen = tree[group].to_dataset(), list(columns)
+    return data[chosen].to_dataframe()[chosen] if chosen else data.to_dataframe()
+
+
+def known_truth(tree: xr.DataTree) -> pd.Series:
+    """The true biases that a scored tree knows, by label; empty where it was not scored."""
+    import pandas as pd  # loaded where a table is made
+
+    known = tree["truth"].to_dataset()["bias"].to_series() if "truth" in tree.children else pd.Series(dtype=float)
+    return known.rename(index=str)
 
 
 def summed_log_likelihood(tree: xr.DataTree) -> xr.DataArray | None:
@@ -133,11 +147,24 @@ class Calibrated:
         return self.spread.matrix()
 
 
+def bias_values(tree: xr.DataTree) -> dict[str, float]:
+    """Value of every bias by label: the mean of a fit, or what it was held at."""
+    means = tree["calibration"].to_dataset()["mean"].to_series().items()
+    return {str(label): float(value) for label, value in means} | held_biases(tree)
+
+
+def stated_values(tree: xr.DataTree) -> dict[str, float]:
+    """Stated value of each component and coordinate of each node, by label."""
+    group = tree["constant_data"].to_dataset()
+    names = zip(group["stated_node"].values, group["stated_component"].values, strict=True)
+    places: Any = group["node_position"].to_series().items()
+    stated = {f"{node}.{name}": float(value) for (node, name), value in zip(names, group["stated"].values, strict=True)}
+    return stated | {f"{node}.position_{axis}": value for (node, axis), value in places}
+
+
 def held_by(calibration: xr.DataTree, labels: Sequence[str]) -> dict[str, float]:
     """The biases among some labels that a fit held fixed, and their values."""
-    constant = calibration["constant_data"].to_dataset()
-    fixed = {str(k): float(v) for k, v in constant["fixed"].to_series().items()} if "fixed" in constant else {}
-    return {label: value for label, value in fixed.items() if label in labels}
+    return {label: value for label, value in held_biases(calibration).items() if label in labels}
 
 
 @checked
@@ -173,26 +200,18 @@ def with_calibration(network: Network, source: xr.DataTree | str | PathLike[str]
     check_valid(source, "with_calibration")
     from probcal.results.drifts import drift_table  # it loads pandas
 
-    group, constant = source["calibration"].to_dataset(), source["constant_data"].to_dataset()
-    found = {str(label): (float(m), float(s)) for label, m, s in
-             zip(group["bias_label"].values, group["mean"].values, group["sd"].values, strict=True)}  # fmt: skip
-    for row in drift_table(source).to_dict("records"):  # the last piece of each stays
-        found[row["bias"]] = (row["mean"], row["sd"])
-    names = zip(constant["stated_node"].values, constant["stated_component"].values, strict=True)
-    stated = {
-        f"{node}.{name}": float(value) for (node, name), value in zip(names, constant["stated"].values, strict=True)
-    }
-    for node, place in zip(constant["node"].values, constant["node_position"].values, strict=True):
-        stated |= {f"{node}.position_{axis}": float(x) for axis, x in zip(constant["axis"].values, place, strict=True)}
-    biases = [bias for bias in network.biases if bias.since is None and bias.label in found]
-    units = dict(zip(group["bias_label"].values.tolist(), group["unit"].values.tolist(), strict=True))
-    if not biases or any(bias.unit != units.get(bias.label, bias.unit) for bias in biases):
+    frame = summary(source).set_index("bias")
+    pieces = drift_table(source).drop_duplicates("bias", keep="last").set_index("bias")
+    frame.loc[pieces.index, ["mean", "sd"]] = pieces[["mean", "sd"]]
+    stated = stated_values(source)
+    biases = [bias for bias in network.biases if bias.since is None and bias.label in frame.index]
+    if not biases or any(bias.unit != frame.loc[bias.label, "unit"] for bias in biases):
         raise InputError(
             "with_calibration: the fit and the network have no bias in common, or in other units; declare the same"
         )
     values = {}
     for bias in biases:
-        mean, sd = found[bias.label]
+        mean, sd = (float(frame.loc[bias.label, name]) for name in ("mean", "sd"))
         if sd > 0:
             values[bias.label] = (mean + (bias.nominal if bias.sensor_type else stated[bias.label]), sd)
     return network.surveyed(values)

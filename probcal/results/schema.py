@@ -100,3 +100,9 @@ def matrix_of(group: Any, name: str, whose: str) -> Any:
 def evidence_in(names: Container[Hashable]) -> str:
     """Which of the evidences is among some names, empty where there is none."""
     return next((name for name in EVIDENCES if name in names), "")
+
+
+def held_biases(tree: Any) -> dict[str, float]:
+    """The biases that a fit held, and their values."""
+    constant = tree["constant_data"].to_dataset() if "constant_data" in tree.children else {}
+    return {str(k): float(v) for k, v in constant["fixed"].to_series().items()} if "fixed" in constant else {}

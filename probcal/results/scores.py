@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from probcal.errors import checked
-from probcal.labels import AXES, NOBODY
+from probcal.labels import NOBODY, coordinates
 from probcal.lazy import Later
 from probcal.results.alignment import Alignment
 from probcal.results.alignment import align as laid_on
-from probcal.results.read import each_target
+from probcal.results.read import each_target, frame_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -31,18 +32,14 @@ def position_rmse(tree: xr.DataTree, truth: Truth, *, align: str | None = None) 
         return None
     if align is not None:
         before, after = (laid_on(places, true, align)(places) for places in (before, after))
-    first, second = (float(np.sqrt(((places - true) ** 2).sum(1).mean())) for places in (before, after))
+    first, second = (rms(np.linalg.norm(places - true, axis=1)) for places in (before, after))
     return first, second
-
-
-def _axes(track: xr.Dataset) -> list[str]:
-    return [f"position_{axis}" for axis in AXES if f"position_{axis}" in track["component"].values]
 
 
 def _true(name: str, track: xr.Dataset, truth: Truth) -> np.ndarray:
     """True positions (E, d) at the epochs of a track, NaN where the truth does not cover them."""
     times = track["time"].values
-    return truth.positions(times, np.full(len(times), name), len(_axes(track)))
+    return truth.positions(times, np.full(len(times), name), len(coordinates(track["component"].values)))
 
 
 def _met(tree: xr.DataTree, truth: Truth) -> list[np.ndarray]:
@@ -52,9 +49,9 @@ def _met(tree: xr.DataTree, truth: Truth) -> list[np.ndarray]:
     for name, track in tracks:
         true = _true(name, track, truth)
         known = np.isfinite(true).all(1)
-        pairs.append([track[kind].sel(component=_axes(track)).values[known] for kind in ("before", "mean")])
-        pairs[-1].append(true[known])
-    return [np.concatenate([part[k] for part in pairs]) if pairs else np.zeros((0, 0)) for k in range(3)]
+        own = track.sel(component=coordinates(track["component"].values))
+        pairs.append([places[known] for places in (own["before"].values, own["mean"].values, true)])
+    return [np.concatenate(parts) for parts in zip(*pairs, strict=True)] or [np.zeros((0, 0))] * 3
 
 
 @checked
@@ -71,16 +68,23 @@ def scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> dict
     positions, suffix = position_rmse(tree, truth, align=align), "" if align is None else f"_{align}"
     if positions is not None:
         found |= {f"position_rmse_before{suffix}": positions[0], f"position_rmse_after{suffix}": positions[1]}
-    if "calibration" in tree.children and truth.biases:
-        group = tree["calibration"].to_dataset()
-        known = [str(label) for label in group["bias_label"].values if str(label) in truth.biases]
-        if known:
-            chosen = group.sel(bias_label=known)
-            true = np.array([truth.biases[label] for label in known])
-            error = (chosen["mean"].values - true) / chosen["scale"].values
-            inside = (chosen["lower"].values <= true) & (true <= chosen["upper"].values)
-            found |= {"bias_rmse": float(np.sqrt(np.mean(error**2))), "coverage": float(inside.mean())}
+    if "calibration" in tree.children and len(known := judged_by(tree, truth.biases)):
+        found |= {"bias_rmse": rms(known["error"]), "coverage": float(known["inside"].mean())}
     return found
+
+
+def judged_by(tree: xr.DataTree, true: Mapping[str, float]) -> Any:
+    """One row a bias whose true value is known: `true`, its `error` in scales, whether the interval has it `inside`."""
+    frame = frame_of(tree, "calibration", "mean", "scale", "lower", "upper")
+    frame["true"] = [true.get(label, np.nan) for label in frame.index]
+    frame["error"] = (frame["mean"] - frame["true"]) / frame["scale"]
+    frame["inside"] = frame["true"].between(frame["lower"], frame["upper"])
+    return frame.dropna(subset="true")
+
+
+def rms(values: Any) -> float:
+    """Root of the mean square of some values."""
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 @checked
@@ -96,11 +100,11 @@ def add_scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> 
     found = scores(tree, truth, align=align)
     _forget(tree)
     tree.attrs.update(found)
-    labels = tree["calibration"].to_dataset()["bias_label"].values.tolist() if "calibration" in tree.children else []
+    labels = tree["calibration"].to_dataset()["bias_label"].values if "calibration" in tree.children else ()
     known = {label: float(value) for label, value in truth.biases.items() if label in labels}
     if known:
         tree["truth"] = xr.DataTree(
-            xr.Dataset({"bias": ("bias_label", list(known.values()))}, coords={"bias_label": list(known)})
+            xr.Dataset({"bias": ("bias_label", list(known.values()))}, {"bias_label": list(known)})
         )
     if "track" not in tree.children:
         return tree
@@ -112,17 +116,17 @@ def add_scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> 
             continue
         places = _true(str(node.attrs["target"]), track, truth)
         columns = np.full(track["mean"].shape, np.nan)
-        columns[:, np.isin(track["component"].values, _axes(track))] = places if frame is None else frame.back(places)
+        located = np.isin(track["component"], coordinates(track["component"].values))
+        columns[:, located] = places if frame is None else frame.back(places)
         node["true"] = xr.DataArray(columns, dims=("time", "component"))
     return tree
 
 
 def _forget(tree: xr.DataTree) -> None:
     """Take out what another truth said, or this one otherwise aligned."""
-    for name in [str(name) for name in tree.attrs if str(name).startswith("position_rmse_")]:
-        del tree.attrs[name]
-    for name in ("bias_rmse", "coverage"):
-        tree.attrs.pop(name, None)
+    for name in [str(name) for name in tree.attrs]:
+        if name.startswith("position_rmse_") or name in ("bias_rmse", "coverage"):
+            del tree.attrs[name]
     if "truth" in tree.children:
         del tree["truth"]
     for node in tree["track"].children.values() if "track" in tree.children else ():

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.detection import Sector
-from probcal.labels import AXES
+from probcal.labels import coordinates
 from probcal.model.epochs import Seen
 from probcal.model.rows import look
 
@@ -30,20 +30,19 @@ def view_variables(problem: Problem, point: Point | None) -> tuple[dict[str, Any
     placed = problem.network.sensors
     if all(sensor.detection is None for sensor in placed):
         return {}, {}
-    told = [sensor.detection for sensor in placed]
-    sectors = [own.view if own is not None and isinstance(own.view, Sector) else None for own in told]
-    columns = {
-        "view_range": [np.nan if own is None else own.range for own in sectors],
-        "view_width": [np.nan if own is None else own.width for own in sectors],
-        "view_towards": [np.nan if own is None else own.towards for own in sectors],
-        "detection_probability": [np.nan if own is None else own.chance for own in told],
-        "clutter": [np.nan if own is None else own.rate for own in told],
+    declared = [sensor.detection for sensor in placed]
+    views = [getattr(own, "view", None) for own in declared]
+    sectors = [view if isinstance(view, Sector) else None for view in views]
+    columns: dict[str, tuple[list[Any], str]] = {
+        "view_range": (sectors, "range"), "view_width": (sectors, "width"), "view_towards": (sectors, "towards"),
+        "detection_probability": (declared, "chance"), "clutter": (declared, "rate"),
+    }  # fmt: skip
+    values: dict[str, Any] = {
+        name: ("sensor", np.array([getattr(own, part, np.nan) for own in owners], float))
+        for name, (owners, part) in columns.items()
     }
-    values: dict[str, Any] = {name: ("sensor", np.array(column, float)) for name, column in columns.items()}
     coords: dict[str, Any] = {"sensor": [sensor.name for sensor in placed]}
-    others = [
-        s for s, own in enumerate(told) if own is not None and own.view is not None and not isinstance(own.view, Sector)
-    ]
+    others = [s for s, view in enumerate(views) if view is not None and not isinstance(view, Sector)]
     if point is None or not others:
         return values, coords
     grid = _grid(problem, point)
@@ -57,10 +56,9 @@ def view_variables(problem: Problem, point: Point | None) -> tuple[dict[str, Any
 def _grid(problem: Problem, point: Point) -> tuple[np.ndarray, np.ndarray, float]:
     """Coordinates x and y of a grid over nodes and tracks, and the mean height of the tracks."""
     d, parts = problem.network.dimension, []
-    z = np.asarray(point.z) * problem.scales
+    shift = dict(zip(problem.labels, np.asarray(point.z) * problem.scales, strict=True))
     for node in problem.network.nodes:
-        labels = [f"{node.name}.position_{axis}" for axis in AXES[:d]]
-        moved = [z[problem.labels.index(label)] if label in problem.labels else 0.0 for label in labels]
+        moved = [shift.get(label, 0.0) for label in coordinates(of=node.name)[:d]]
         parts.append((node.position + moved)[None] if node.path is None else node.path.position)
     flown = problem.positions(problem.model.vectors_of(point.states))
     whole = np.concatenate([*parts, *flown])

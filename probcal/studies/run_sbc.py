@@ -5,16 +5,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-import xarray as xr
-
-from probcal.cli.files import can_plot, say_written, write_csv
+from probcal import plots
+from probcal.cli.files import write_result
 from probcal.cli.models import load_problem, on_network, prior_named
 from probcal.cli.progress import shown
 from probcal.files import Outputs
 from probcal.inference import METHODS
 from probcal.priors import PRIORS
-from probcal.results.io import save
 from probcal.studies.coverage import coverage_table
 from probcal.studies.sbc import sbc, short
 
@@ -49,18 +46,5 @@ def run(
     if tree.attrs["message"]:
         print(tree.attrs["message"])
     if outputs is not None:
-        with outputs.writing(tree.attrs["identity"]):
-            _write(tree, table, outputs.folder)
+        write_result(outputs, tree, table, lambda path: plots.draw_sbc(tree, path), tree.attrs["identity"])
     return 0 if tree.attrs["status"] == "uniform" else 1
-
-
-def _write(tree: xr.DataTree, table: pd.DataFrame, out: Path) -> None:
-    files = [out / "sbc.nc", out / "sbc.csv"]
-    save(tree, files[0])
-    write_csv(table, files[1])
-    if can_plot():
-        from probcal.studies.plot_sbc import draw_sbc  # the plot packages are an extra
-
-        files.append(out / "sbc.png")
-        draw_sbc(tree, files[-1])
-    say_written(files)
