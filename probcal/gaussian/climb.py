@@ -18,7 +18,7 @@ from probcal.gaussian.engine import Engine, Expansion, Factors, evidence
 from probcal.gaussian.marginal import ENOUGH, LEAST_CURVED, SETTLED, TRACK_STEPS
 from probcal.gaussian.mode import Point, eliminate, follow
 from probcal.gaussian.search import HALVINGS, between, halved
-from probcal.gaussian.tails import Variances, renewed
+from probcal.gaussian.tails import Variances, update_noise
 from probcal.model.model import Model
 from probcal.priors import Precision
 
@@ -139,7 +139,7 @@ def climb_with_noise(
         if still or told(len(trace) - 1, trace[-1]) or len(trace) > turns or not np.isfinite(trace[-1]):
             refused = mode.refused and len(trace) == 2
             return mode._replace(trace=np.array(trace[1:]), converged=mode.converged and still, refused=refused)
-        model, point = renewed(model, mode.at.point, Variances.of(mode.at, factors))
+        model, point = update_noise(model, mode.at.point, Variances.of(mode.at, factors))
 
 
 def _slope(at: Expansion, factors: Factors) -> np.ndarray:

@@ -43,7 +43,7 @@ class Variances(NamedTuple):
 
 
 @jax.jit
-def renewed(model: Model, point: Point, variances: Variances) -> tuple[Model, Point]:
+def update_noise(model: Model, point: Point, variances: Variances) -> tuple[Model, Point]:
     """Model and point with the unknown levels and the precisions of tails that follow at the same states."""
     weights = expected_mixing(model, point, variances.noises)
     point = update_levels(model, point, *variances) if point.levels.shape[0] else point
