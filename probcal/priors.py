@@ -31,7 +31,7 @@ class Coupling(NamedTuple):
 
 
 class Precision(NamedTuple):
-    """Gaussian prior of z with precision diag(alpha) and couplings; `logdet` is the share of these in log |.|."""
+    """Gaussian prior of z: diag(alpha) and couplings, of which `logdet` is the log determinant."""
 
     alpha: jax.Array  # (M,) precision of each bias alone, 0 where flat
     coupling: tuple[Coupling, ...] = ()
@@ -39,7 +39,7 @@ class Precision(NamedTuple):
 
     @classmethod
     def correlated(cls, alpha: jax.Array, groups: Iterable[tuple[np.ndarray, float]]) -> "Precision":
-        """Precisions alpha (M,), and groups of biases of unit variance each of whose pairs has one correlation."""
+        """Precisions alpha (M,), and groups of biases with one correlation between every two."""
         coupling, logdet = list[Coupling](), 0.0
         for members, value in groups:
             p = len(members)
@@ -171,9 +171,10 @@ class Prior:
         return Precision.correlated(alpha, self.correlated(labels, surveyed))
 
     def correlated(self, labels: Sequence[str], surveyed: np.ndarray) -> list[tuple[np.ndarray, float]]:
-        """Biases by number and their correlation for each pattern; those in `surveyed` (M,) have their own Gaussian.
+        """Biases by number and their correlation for each pattern.
 
-        Raises `InputError` for a pattern that reaches biases which are not Gaussian, or others have taken.
+        Those in `surveyed` (M,) have their own Gaussian. Raises `InputError` for a pattern that
+        reaches biases which are not Gaussian, or others have taken.
         """
         found, coupled = list[tuple[np.ndarray, float]](), np.zeros(len(labels), bool)
         for pattern, value in self.correlation:

@@ -18,7 +18,7 @@ from probcal.gaussian.engine import Engine, Expansion, Factors, evidence
 from probcal.gaussian.marginal import ENOUGH, LEAST_CURVED, SETTLED, TRACK_STEPS
 from probcal.gaussian.mode import Point, eliminate, follow
 from probcal.gaussian.search import HALVINGS, between, halved
-from probcal.gaussian.tails import Variances, update_noise
+from probcal.gaussian.tails import Variances, renewed_noise
 from probcal.model.model import Model
 from probcal.priors import Precision
 
@@ -121,25 +121,38 @@ def climb_to_mode(
 
 
 def climb_with_noise(
-    engine: Engine, model: Model, start: Point, prior: Precision, factors: Factors, steps: int, turns: int,
-    tolerance: float, told: Callable[[int, float], bool],
-) -> Climbed:  # fmt: skip
-    """Climb in turn to the mode of the biases and to the noise of largest evidence there, where it is not known.
+    engine: Engine,
+    model: Model,
+    start: Point,
+    prior: Precision,
+    factors: Factors,
+    steps: int,
+    turns: int,
+    tolerance: float,
+    told: Callable[[int, float], bool],
+) -> Climbed:
+    """Climb in turn to the mode of the biases and, where noise is not known, to that of largest
+    evidence.
 
-    It ends where a turn moves the evidence by less than the tolerance; the trace is then the evidence after each.
-    `factors` are those of the prior.
+    It ends where a turn moves the evidence by less than the tolerance; the trace is then the
+    evidence after each. `factors` are those of the prior.
     """
     point, trace = start, [-np.inf]
     while True:
-        mode = climb_to_mode(partial(engine.settled, model), point, factors, steps, 1e-2 * tolerance, told)
+        expand = partial(engine.settled, model)
+        mode = climb_to_mode(expand, point, factors, steps, 1e-2 * tolerance, told)
         if not model.learns_noise:
             return mode
         trace.append(evidence(mode.at, prior, factors).value)
         still = abs(trace[-1] - trace[-2]) < tolerance
-        if still or told(len(trace) - 1, trace[-1]) or len(trace) > turns or not np.isfinite(trace[-1]):
-            refused = mode.refused and len(trace) == 2
-            return mode._replace(trace=np.array(trace[1:]), converged=mode.converged and still, refused=refused)
-        model, point = update_noise(model, mode.at.point, Variances.of(mode.at, factors))
+        ended = told(len(trace) - 1, trace[-1]) or len(trace) > turns
+        if still or ended or not np.isfinite(trace[-1]):
+            return mode._replace(
+                trace=np.array(trace[1:]),
+                converged=mode.converged and still,
+                refused=mode.refused and len(trace) == 2,
+            )
+        model, point = renewed_noise(model, mode.at.point, Variances.of(mode.at, factors))
 
 
 def _slope(at: Expansion, factors: Factors) -> np.ndarray:

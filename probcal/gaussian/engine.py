@@ -58,7 +58,7 @@ class Factors:
 
     @classmethod
     def coupled(cls, prior: Precision) -> Factors:
-        """What the correlations of a Gaussian prior add to `alone`: a factor for the biases of each."""
+        """The factors that correlations of a Gaussian prior add to `alone`."""
         parts = [(np.asarray(members)[None], np.asarray(own)[None]) for members, own in prior.coupling]
         return cls(tuple(Group(members, own, np.zeros(members.shape)) for members, own in parts))
 

@@ -98,9 +98,9 @@ def state_covariances(model: Model, point: Point) -> tuple[jax.Array, ...]:
 def update_levels(model: Model, point: Point, spread: Data, driven: tuple[jax.Array, ...]) -> Point:
     """One MacKay step of every unknown noise level, kept within its declared factor by its log-normal prior.
 
-    A level sigma of N whitened residuals v solves N - sum Var v = sum v^2 (Paper B 25, for noise); the variances are
-    those of predicted values (N, C) and of whitened noises (E, n). The trajectory stays; its whitened noises are
-    rescaled.
+    A level sigma of N whitened residuals v solves N - sum Var v = sum v^2 (Paper B 25, for noise);
+    the variances are those of predicted values (N, C) and of whitened noises (E, n). The trajectory
+    stays; its whitened noises are rescaled.
     """
     H = point.levels.shape[0]
     count, square = model.by_level(model.measured), model.by_level(model.level_score(point))

@@ -123,8 +123,8 @@ class JointPrecision:
         return whole
 
     def with_pairs(self, model: Model, pairs: Sequence[np.ndarray]) -> JointPrecision:
-        """A pattern in which biases in one row of `pairs` (B, p) have entries with each other: this one
-        where they have."""
+        """A pattern with entries for the biases in one row of `pairs` (B, p); this one where it has
+        them."""
         if all(self.holds(own) for own in pairs):
             return self
         if not (self._wider and all(self._wider[0].holds(own) for own in pairs)):

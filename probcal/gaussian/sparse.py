@@ -34,7 +34,8 @@ class SparseEngine:
     sparse matrix."""
 
     library: Library
-    _patterns: list[tuple[list[Any], JointPrecision]] = field(default_factory=list, compare=False)  # of the last form
+    # of the last form of a model
+    _patterns: list[tuple[list[Any], JointPrecision]] = field(default_factory=list, compare=False)
 
     cheap: ClassVar[bool] = False
 

@@ -24,7 +24,7 @@ ROUNDS, STILL = 50, 1e-3  # of precisions and trajectories in turn, and change o
 
 
 class Variances(NamedTuple):
-    """What noise levels and precisions follow from: posterior variances at a point."""
+    """Posterior variances at a point, from which noise levels and precisions follow."""
 
     predicted: Data  # (N, C) of each predicted value
     noises: tuple[jax.Array, ...]  # (E, n) of each whitened noise
@@ -43,15 +43,15 @@ class Variances(NamedTuple):
 
 
 @jax.jit
-def update_noise(model: Model, point: Point, variances: Variances) -> tuple[Model, Point]:
-    """Model and point with the unknown levels and the precisions of tails that follow at the same states."""
+def renewed_noise(model: Model, point: Point, variances: Variances) -> tuple[Model, Point]:
+    """Model and point with the unknown levels and precisions of tails that follow."""
     weights = expected_mixing(model, point, variances.noises)
     point = update_levels(model, point, *variances) if point.levels.shape[0] else point
     return model.with_mixing(weights), rewhitened(model, point, weights)
 
 
 def expected_mixing(model: Model, point: Point, variances: tuple[jax.Array, ...]) -> Mixing:
-    """Mean precisions (E,) of every tail at a point, for variances (E, n) of its whitened noises."""
+    """Mean precisions (E,) of every tail, for variances (E, n) of the whitened noises."""
 
     def means(part: Recursion, u: jax.Array, variance: jax.Array) -> tuple[jax.Array, ...]:
         squares = [jnp.sum((u**2 + variance)[:, slice(*tail.columns)], 1) / tail.weight for tail in part.tails]

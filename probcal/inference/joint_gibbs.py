@@ -149,8 +149,11 @@ class Gibbs(Sampler):
 def check_gibbs(problem: Problem, prior: Prior) -> None:
     """Raise `InputError` naming what `Gibbs` does not take."""
     model = problem.model
-    lacks = {"unknown noise levels": bool(problem.levels), "process noise that is not Gaussian": model.tailed}
-    lacks["a motion without a linear form"] = any(form is not None for form in model.sampled)
+    lacks = {
+        "unknown noise levels": bool(problem.levels),
+        "process noise that is not Gaussian": model.tailed,
+        "a motion without a linear form": any(form is not None for form in model.sampled),
+    }
     for what, has in lacks.items():
         if has:
             raise InputError(f"Gibbs() does not take {what}: take Collapsed() or NUTS()")

@@ -13,12 +13,13 @@ from probcal.gaussian.mode import Point
 from probcal.gaussian.places import places_of, tilt_of
 from probcal.problem import Problem
 
-TILTS, ASIDE = 12, 0.02  # most climbs with integrated places, and sds by which the last may leave a bias aside
+TILTS = 12  # most climbs with integrated places
+ASIDE = 0.02  # sds by which the last may leave a bias aside
 SLACK = 0.02  # nats by which the density of integrated places may fall by rounding
 
 
 class Reached(NamedTuple):
-    """Where a climb ended."""
+    """The end of a climb."""
 
     problem: Problem  # that was solved
     at: Expansion
@@ -28,17 +29,25 @@ class Reached(NamedTuple):
 
 
 def with_places(
-    climb: Callable[[Problem, Point], Reached], first: Reached, engine: Engine, stopped: Callable[[], Any]
+    climb: Callable[[Problem, Point], Reached],
+    first: Reached,
+    engine: Engine,
+    stopped: Callable[[], Any],
 ) -> tuple[Reached, bool]:
-    """The end of climbs with what integrated places add where the density is largest, and whether they agree.
+    """Climb with what integrated places add where the density is largest; also whether both agree.
 
-    What they add is known near a point: a climb that does not raise the density is repeated with a leash, and
-    has one where it leaves as much to go as the climb before.
+    What they add is known near a point: a climb that does not raise the density is repeated within
+    a trust region, and has one where it leaves as much to go as the climb before.
     """
     here, chosen = first, places_of(first.at.model, first.at.point)
     if chosen is None or not any(np.any(own.on) for own in chosen):
         return first, True
-    tilt, leash, wanted, done = tilt_of(here.problem.model, here.at.point, chosen), 0.0, np.inf, False
+    tilt, leash, wanted, done = (
+        tilt_of(here.problem.model, here.at.point, chosen),
+        0.0,
+        np.inf,
+        False,
+    )
     if tilt is None:
         return first, False
     value = here.value + float(tilt.height)
@@ -62,7 +71,8 @@ def with_places(
 
 
 def _metric(at: Expansion, dimensions: int) -> np.ndarray:
-    """Information (M, M) of the data and of a prior of unit scale; that of the prior (M,) of very many biases."""
+    """Information (M, M) of the data and of a prior of unit scale; of many biases that of the prior
+    (M,)."""
     information = at.information() if dimensions == 2 else None
     return np.ones(at.model.biases) if information is None else information + np.eye(len(information))
 

@@ -107,8 +107,8 @@ def sweep_blocks(
 ) -> tuple[BlockChain, BlocksSwept]:
     """Gibbs sweeps over the hyper-parameters of all biases and the biases of each block, given its cavity (B, p, p).
 
-    The prior is exact, with all that biases share; moments are those of the Gaussians given hyper-parameters. The
-    cavities hold the prior of what no hierarchy governs.
+    The prior is exact, with all that biases share; moments are those of the Gaussians given
+    hyper-parameters. The cavities hold the prior of what no hierarchy governs.
     """
     kind, M = form.hierarchy, form.biases
     learnt, (B, p) = jnp.asarray(kind.learnt, int), members.shape

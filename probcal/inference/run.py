@@ -21,7 +21,7 @@ from probcal.gaussian.engine import Engine, Factors
 from probcal.gaussian.information import mean_square
 from probcal.gaussian.linearised import LaplaceApproximation, laplace
 from probcal.gaussian.mode import Point
-from probcal.gaussian.tails import Variances, update_noise
+from probcal.gaussian.tails import Variances, renewed_noise
 from probcal.inference.ending import FAR, conclude
 from probcal.inference.engined import climb_on
 from probcal.inference.hierarchy import held, learnt_groups
@@ -202,13 +202,13 @@ def valued(prior: Prior, given: Given, state: State) -> State:
 
 
 def renew_noise(model: Model, state: State, covariance: jax.Array, fresh: Any = False) -> tuple[Model, State]:
-    """Model and state with the levels and precisions of noise that follow from the point, for a covariance of z.
+    """Model and state with the noise that follows from the point, for a covariance of z.
 
     Where all noise is Gaussian and known, and where the state is `fresh`, they stay.
     """
     if not model.learns_noise:
         return model, state
-    after, point = update_noise(model, state.point, Variances.dense(model, state.point, covariance))
+    after, point = renewed_noise(model, state.point, Variances.dense(model, state.point, covariance))
     point, mixing = jax.tree.map(
         lambda new, old: jnp.where(fresh, old, new), (point, after.mixing), (state.point, state.mixing)
     )

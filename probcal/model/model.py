@@ -427,7 +427,7 @@ class Model(Stepwise):
 
     @property
     def learns_noise(self) -> bool:
-        """Whether a fit finds some of the noise: unknown levels, or precisions of noise that is not Gaussian."""
+        """Whether a fit finds some of the noise: unknown levels, or precisions of tails."""
         return self.tailed or self.level_spread.shape[0] > 0
 
     @property
