@@ -193,7 +193,7 @@ MUTATIONS = [
     Mutation("round(float(np.rad2deg(value)), 12)", "round(float(value), 12)", "test_nodes.py"),
     Mutation("self.path.position + (stated - self.position)", "self.path.position", "test_nodes.py"),
     Mutation("node.sizes[component] = tuple(sds)", "node.sizes[component] = (max(sds),) * len(sds)", "test_nodes.py"),
-    Mutation("cholesky(unit + LOSS", "cholesky(unit + 4.0", "test_storage.py"),
+    Mutation("np.linalg.cholesky(unit + LOSS", "np.linalg.cholesky(unit + 4.0", "test_storage.py"),
     # geometry.py
     Mutation("jnp.round(angle / period)", "jnp.floor(angle / period)", "test_catalogue.py"),
     Mutation("jnp.stack([norm(line[:2]), line[2]])", "jnp.stack([norm(line), line[2]])", "test_catalogue.py"),

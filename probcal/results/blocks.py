@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from probcal.linalg import invert, root_of
 from probcal.results.schema import matrix_of
 
 if TYPE_CHECKING:
@@ -130,7 +129,7 @@ class SensorBlocks(NamedTuple):
     def under_scales(self) -> SensorBlocks:
         """What a prior of one scale a bias makes of those of a flat prior."""
         eye = np.eye(self.members.shape[1])[None]
-        return self._replace(covariance=invert(invert(self.covariance) + eye))
+        return self._replace(covariance=np.linalg.inv(np.linalg.inv(self.covariance) + eye))
 
     def root(self) -> Any:
         """A root (M, R) of the covariance, sparse where sensors are independent."""
@@ -144,5 +143,6 @@ class SensorBlocks(NamedTuple):
         row = np.broadcast_to(self.members[:, :, None], (B, p, p))
         column = np.broadcast_to((p * np.arange(B)[:, None] + np.arange(p))[:, None, :], (B, p, p))
         there = row < self.biases
-        root = root_of(np.where(there & there.mT, self.covariance, 0.0))  # of rank 0 too, as of chains that stand still
+        values, vectors = np.linalg.eigh(np.where(there & there.mT, self.covariance, 0.0))
+        root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]  # of rank 0 too, as of chains that stand still
         return csc_array((root[there], (row[there], column[there])), (self.biases, B * p))

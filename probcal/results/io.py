@@ -13,7 +13,6 @@ import numpy as np
 from probcal.errors import InputError, checked
 from probcal.files import write_whole
 from probcal.lazy import Later
-from probcal.linalg import cholesky
 from probcal.results.accessor import register
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import (
@@ -205,7 +204,7 @@ def _semi_definite(matrices: np.ndarray) -> bool:
     if not (np.abs(unit - unit.swapaxes(1, 2)) <= LOSS).all():
         return False
     try:
-        cholesky(unit + LOSS * np.eye(unit.shape[1]))
+        np.linalg.cholesky(unit + LOSS * np.eye(unit.shape[1]))
     except np.linalg.LinAlgError:
         return False
     return True
