@@ -31,9 +31,8 @@ def study_table(study: xr.Dataset) -> pd.DataFrame:
     if bool(there.any()) and not bool((there | study["true"].isnull()).all()):
         table["of non-zero"] = inside.mean(["run", "bias_label"]).to_series().reindex(table.index)
     table["runs"] = groups.size()
-    for status in map(str, Status):
-        frame[status] = frame["status"] == status
-        table[status] = frame.reset_index().groupby([*grid_of(study), "estimator"], sort=False)[status].sum()
+    ended = groups["status"].value_counts().unstack(fill_value=0)
+    table = table.join(ended.reindex(columns=[str(status) for status in Status], fill_value=0))
     return table.reset_index().rename(columns={"estimator": "method"}).dropna(axis=1, how="all")  # no sd of one run
 
 

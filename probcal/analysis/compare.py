@@ -63,7 +63,7 @@ def compare(fits: Fits, names: Sequence[str] | None = None) -> xr.DataTree:
     for name, found in loo.elpd(known, order).items():
         methods[name].attrs |= found
     groups |= {f"method/{name}": dataset for name, dataset in methods.items()}
-    sampled = [n for n, t in known.items() if not plugged_in(t) and _sound(t)]
+    sampled = [n for n, t in known.items() if not plugged_in(t) and t.attrs["status"] not in INVALID]
     exact = [n for n in sampled if known[n].attrs["approximate"] == "exact"]
     reference = next(iter([*exact, *sampled, *known]))
     tree = xr.DataTree.from_dict(groups)
@@ -140,10 +140,6 @@ def chosen_pair(fits: Mapping[str, xr.DataTree], labels: Sequence[str]) -> tuple
         if label not in common:
             raise InputError(f'the pair names "{label}", which is no bias of all the fits{nearest(label, common)}')
     return pair
-
-
-def _sound(tree: xr.DataTree) -> bool:
-    return tree.attrs["status"] not in INVALID
 
 
 def common_labels(fits: Mapping[str, xr.DataTree], verb: str = "compare") -> list[str]:

@@ -221,8 +221,6 @@ class Engine(Protocol):
         """The same at the modes of its trajectories for its biases."""
 
 
-
-
 def evidence(at: Expansion, prior: Precision, factors: Factors | None = None) -> Estimate:
     """Log evidence at the mode under a Gaussian prior, trajectories and biases integrated by
     Laplace's formula.

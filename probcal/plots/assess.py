@@ -90,9 +90,9 @@ def plot_halves(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     """Draw the change of each bias from the first half to the second in units of its scale, with its limits."""
     group = tree["halves"].to_dataset()
     group = group.assign(scale=tree["calibration"]["scale"].sel(bias_label=group["bias_label"]))
-    limit = float(group.attrs["limit"])
     title = f"Change between halves (at {group.attrs['time']:.4g} s)"
-    return _draw_changes(group, abs(group["t"]) > limit, "second half less first", title, ax)
+    moved = abs(group["t"]) > group.attrs["limit"]
+    return _draw_changes(group, moved, "second half less first", title, ax)
 
 
 def plot_changes(tree: xr.DataTree, ax: Axes | None = None) -> Axes:

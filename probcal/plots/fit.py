@@ -86,7 +86,7 @@ def plot_outliers(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     frame["ratio"] = frame["after"] / frame["std"]
     ax = new_axes(ax, 9.0, 3.4)
     out = frame["weight"] < 0.5
-    inlying = frame[~out][:: 1 + int((~out).sum()) // ALL_POINTS]
+    inlying = frame[~out][:: 1 + (~out).sum() // ALL_POINTS]
     ax.plot("time", "ratio", ".", data=inlying, color=BEFORE, markersize=2, rasterized=True, label="inlying")
     for k, (name, own) in enumerate(frame[out].groupby("sensor", sort=False)):
         label = plain_text(name) if k < 10 else None
@@ -95,7 +95,7 @@ def plot_outliers(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     linear = max(LINEAR, float(sizes.quantile(0.9)))
     if sizes.max() > 2 * linear:
         ax.set_yscale("symlog", linthresh=linear)
-    title = f"Residuals over time: {int(out.sum())} of {len(out)} count less than half"
+    title = f"Residuals over time: {out.sum()} of {len(out)} count less than half"
     return finish(ax, title, xlabel="time in s", ylabel="residual/std")
 
 
@@ -145,8 +145,8 @@ def plot_gamma(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     if few:
         ax.set_xticks(range(len(order)), [plain_text(label) for label in order], rotation=90, fontsize=7)
     title = f"How well the data determine {len(order)} biases (0 prior only, 1 data only)"
-    text = "" if few else "bias, sorted by gamma"
-    return finish(ax, title, grid="y", xlabel=text, ylabel="gamma", ylim=(-0.04, 1.04))
+    ax.set_xlabel("" if few else "bias, sorted by gamma")
+    return finish(ax, title, grid="y", ylabel="gamma", ylim=(-0.04, 1.04))
 
 
 def _kind(label: str) -> str:

@@ -90,8 +90,7 @@ def _encircled(shown: Scene) -> bool:
 def _sources(tree: xr.DataTree, shown: Scene) -> dict[str, ColumnDataSource]:
     """Columns that all panels share: epochs, nodes."""
     nodes, d = shown.nodes, shown.dimension
-    tracks = shown.tracks
-    sizes = [len(track.time) for track in tracks]
+    tracks, sizes = shown.tracks, [len(track.time) for track in shown.tracks]
     epochs: dict[str, Any] = {
         "target": np.repeat([track.target for track in tracks], sizes).tolist(),
         "time": np.concatenate([np.empty(0), *(track.time for track in tracks)]),
@@ -143,7 +142,7 @@ def _panel(shown: Scene, sources: dict[str, ColumnDataSource], axes: tuple[int, 
     (left, bottom), (right, top) = low, high = shown.low[plane], shown.high[plane]
     frame = sheet.quad(left=left, right=right, bottom=bottom, top=top, alpha=0.0)  # what the limits hold
     sheet.x_range, sheet.y_range = (DataRange1d(name=name, renderers=[frame], range_padding=0.0) for name in (x, y))
-    sheet.grid.visible = (flat and shown.frame is None) or not flat
+    sheet.grid.visible = not flat or shown.frame is None
     sheet.grid.grid_line_color, sheet.grid.grid_line_alpha = MIDDLE, 0.25
     if flat and shown.frame is not None:
         _draw_graticule(sheet, shown.frame, low, high, shown.dimension)

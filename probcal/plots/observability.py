@@ -33,7 +33,7 @@ def plot_spectrum(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     ax.axhline(1.0, color="0.3", linewidth=0.8)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.legend(frameon=False, fontsize=8)
-    title = f"{int(weak.sum())} of {len(values)} directions are weak"
+    title = f"{weak.sum()} of {len(values)} directions are weak"
     return finish(ax, title, key=False, xlabel="eigenvalue", ylabel="information in prior scales")
 
 
