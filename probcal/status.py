@@ -133,12 +133,12 @@ CHAINS = (  # the gravest of those that hold; all are said
     Rule(
         "sides",
         Status.CONVERGED,
-        "The posterior has {sides[0]} sides, of weights {sides[1]}; r_hat is within sides.",
+        "The posterior has {sides[0]} modes, of weights {sides[1]}; r_hat is within modes.",
     ),
     Rule(
         "unsure",
         Status.NOT_CONVERGED,
-        "The chains hardly cross between the sides, so that their weights are not known; take more draws.",
+        "The chains hardly jump between the modes, so that their weights are not known; take more draws.",
     ),
     Rule(
         "divergences",
@@ -158,12 +158,12 @@ CHAINS = (  # the gravest of those that hold; all are said
     Rule(
         "accepted",
         Status.CONVERGED,
-        "Leaps are taken in {accepted:.1%} of the tries: biases move by swings alone.",
+        "The delayed-acceptance rate is {accepted:.1%}: biases move only through HMC steps.",
     ),
     Rule(
         "hmc",
         Status.NOT_CONVERGED,
-        "A chain takes {hmc:.1%} of its swings: its tracks hardly move; take nuts.",
+        "The HMC acceptance rate of a chain is {hmc:.1%}: its tracks hardly move; take NUTS().",
     ),
     Rule("turns", Status.NOT_CONVERGED, "A chain takes {turns[0]:.1%} of its {turns[1]}."),
     Rule(

@@ -290,7 +290,7 @@ def numbers(table: Table, column: pd.Series, name: str) -> tuple[np.ndarray, np.
     """Values (N,) with zeros where blank, and which are there; raises `InputError` naming row and column."""
     found = _floats(column)
     text = np.isnan(found) & column.notna().to_numpy()
-    table.refuse(text, name, ': "{}" is no number; leave it blank', column.to_numpy())
+    table.refuse(text, name, ': "{}" is no number; leave it blank', column.to_numpy(object))
     table.refuse(np.isinf(found), name, ": the value is infinite; leave it blank")
     table.refuse(np.abs(found) > LARGEST, name, ": {:g} is too large; leave it blank", found)
     there = ~np.isnan(found)

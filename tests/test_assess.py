@@ -567,6 +567,23 @@ def test_a_flat_prior_and_another_method():
     assert (out["verdict"]["contraction"] < 1).all()
 
 
+@pytest.mark.ci
+def test_a_sensor_left_out_is_predicted_under_correlated_priors():
+    """Its elpd is the evidence less that where its rows weigh nothing."""
+    problem, _ = worlds.linear("plane")
+    prior, start = probcal.Gaussian(correlation={"*.position_x": 0.5}), worlds.resting(problem)
+
+    def evidence(left=None):
+        frame = problem.measurements.table.frame
+        frame = frame.assign(weight=np.where(frame["sensor"] == left, 1e-9, 1.0))
+        weighed = probcal.Problem(problem.network, problem.motion, frame)
+        return probcal.fit(weighed, MAP(), prior=prior, start=start).attrs["log_evidence"]
+
+    elpd = assess(problem, probcal.fit(problem, MAP(), prior=prior, start=start))["sensor_check"]["elpd"]
+    wanted = [evidence() - evidence(name) for name in elpd["sensor"].values]
+    np.testing.assert_allclose(elpd, wanted, rtol=1e-6)
+
+
 # Edges, and real data
 
 

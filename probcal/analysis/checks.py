@@ -221,7 +221,8 @@ def by_datum(fit: Judged, found: residuals.Innovations, tree: xr.DataTree) -> tu
 def left_out(fit: Judged, tree: xr.DataTree, groups: dict[str, xr.Dataset]) -> list[Finding]:
     """Add to the groups `sensor_check` and `target_check` what the rest says of each; returns findings.
 
-    Of a large network those of the largest mean squares are left out, and stand in `sensor_left` and `target_left`.
+    Of a large network those of the largest mean squares are left out; they stand in `sensor_left`
+    and `target_left`, whose attribute `of` says of how many.
     """
     findings = list[Finding]()
     for name, leaves in (("sensor", leave.leave_sensors), ("target", leave.leave_targets)):
@@ -231,7 +232,7 @@ def left_out(fit: Judged, tree: xr.DataTree, groups: dict[str, xr.Dataset]) -> l
             check["pareto_k"] = (name, leave.psis(tree, group, len(labels)).pareto_k)
         if not fit.engine.cheap:
             worst = np.sort(np.argsort(-check["nis"].values, kind="stable")[:LOOKED])
-            check = groups[f"{name}_left"] = check.isel({name: worst})
+            check = groups[f"{name}_left"] = check.isel({name: worst}).assign_attrs(of=check.sizes[name])
         if (found := leaves(fit, check[name].values.tolist())) is None:
             continue
         names = check[name].values.tolist()

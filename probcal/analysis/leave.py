@@ -130,7 +130,7 @@ def leave_sensors(fit: Judged, chosen: Collection[str]) -> Left | None:
     `elpd` less `stated` says how much better the sensor fits the rest calibrated than as stated.
     """
     problem, readers = fit.problem, fit.readers
-    alpha, none = fit.factors.diagonal(problem.model.biases), np.zeros(problem.model.biases, bool)
+    alpha, none = np.asarray(fit.prior.alpha), np.zeros(problem.model.biases, bool)
     sensor = problem.measurements.sensor
     counted = set(fit.data["sensor"])  # some have rows of weight 0 only
     present = [s for s in np.unique(sensor) if problem.network.sensors[s].name in counted]
@@ -154,7 +154,7 @@ def leave_targets(fit: Judged, chosen: Collection[str]) -> Left | None:
     if len(present) < 2 or len(chosen) > TARGETS:
         return None
     present = [t for t in present if problem.measurements.target_names[t] in chosen]
-    alpha, none = fit.factors.diagonal(problem.model.biases), np.zeros(problem.model.biases, bool)
+    alpha, none = np.asarray(fit.prior.alpha), np.zeros(problem.model.biases, bool)
     refits = _Refits(fit, len(present))
     whole = refits.run(None, alpha, none)
     rows = [[refits.run(target == t, alpha, none), whole, whole] for t in present]

@@ -81,8 +81,9 @@ def plot_left_out(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     ax.barh(range(len(gains)), gains, color=[COLOURS[1], *[COLOURS[0]] * (len(gains) - 1)], height=0.7)
     ax.axvline(0.0, color="0.3", linewidth=0.8)
     name_rows(ax, gains.index)
-    more = f", the largest {len(gains)} of {gain.size}" if len(gains) < gain.size else ""
-    title = f"Each sensor predicted by the rest{more}"
+    all_of = check.attrs.get("of", gain.size)
+    part = f": {len(gains)} of {all_of} sensors" if len(gains) < all_of else ""
+    title = f"Each sensor predicted by the rest{part}"
     return finish(ax, title, grid="x", key=False, xlabel="elpd calibrated less elpd as stated, nats")
 
 
