@@ -77,11 +77,12 @@ VERBS = {  # what each answers in numbers to the world, by the fit of an engine 
 METHODS = {
     "EA": lambda engine: pc.EA(engine=named(engine)),
     "MAP": lambda engine: pc.MAP(engine=named(engine)),
+    "LeastSquares": lambda engine: pc.LeastSquares(engine=named(engine)),
     "Gibbs": lambda engine: pc.Gibbs(chains=2, warmup=10, draws=10),
 } | {  # detections without names, which `SelfConfiguration` asks for, are another world
     name: lambda engine, name=name: getattr(pc, name)()
     for name in of_priors().index
-    if name not in ("EA", "MAP", "Gibbs", "SelfConfiguration")
+    if name not in ("EA", "MAP", "LeastSquares", "Gibbs", "SelfConfiguration")
 }
 NOT = {  # what is not done, by the heading of a column: part of the sentence that says so
     "observability": {"iterative": "without a factor of the biases variances"},
@@ -89,7 +90,7 @@ NOT = {  # what is not done, by the heading of a column: part of the sentence th
     "EA": {"iterative": GIVEN},
 } | {
     name: dict.fromkeys(list(KINDS.values())[1:], DENSE)
-    for name in ("bound_map", "log_evidence", *METHODS) if name not in ("EA", "MAP", "Gibbs")
+    for name in ("bound_map", "log_evidence", *METHODS) if name not in ("EA", "MAP", "LeastSquares", "Gibbs")
 }  # fmt: skip
 
 BY_SIZE = {"bounds", "next_passes", "next_anchors", "next_sensors", "sensitivity", "Gibbs"}  # nobody asks them for one

@@ -78,6 +78,8 @@ CORRELATED = {"*.heading": 0.6}
     ("world", "method", "prior"),
     [
         ("loud", pc.MAP(tolerance=1e-3), pc.Gaussian()),
+        ("loud", pc.MAP(tolerance=1e-3, trajectory="joint"), pc.Gaussian()),
+        ("drawn", pc.LeastSquares(), pc.Flat()),
         ("drawn", pc.MAP(), pc.Gaussian(correlation=CORRELATED)),
         ("drawn", pc.EA(), pc.Horseshoe(kinds={"*.heading": pc.Gaussian(correlation=CORRELATED)})),
     ],
@@ -385,7 +387,6 @@ def test_a_library_that_has_no_room_says_so(said, monkeypatch):
 @pytest.mark.parametrize(
     ("method", "prior", "settings", "said"),
     [
-        (pc.MAP(engine="cholmod", trajectory="joint"), pc.Gaussian(), {}, 'takes trajectory="marginal" alone'),
         (pc.EA(engine="cholmod", precisions="maximised"), None, {}, "precisions that are integrated or given"),
         (pc.MAP(engine="cholmod"), pc.Gaussian(), {"starts": 3}, "takes one start"),
         (pc.MAP(engine="cholmod"), pc.Gaussian(), {"save": ("states",)}, "keeps no draws of states or replicas"),

@@ -75,25 +75,31 @@ class Climbed(NamedTuple):
 
 def climb_to_mode(
     expand: Callable[[Point], Expansion], start: Point, factors: Factors, iterations: int, tolerance: float,
-    told: Callable[[int, float], bool] | None = None,
+    told: Callable[[int, float], bool] | None = None, *, marginal: bool = True,
 ) -> Climbed:  # fmt: skip
     """Climb to the mode of the marginal density times factors until a step promises less than
     tolerance.
 
-    `expand` gives the posterior at a point whose tracks it settles first. A step that does not
-    bring its share of what it promises is halved. It ends where `told`, called with the number of
-    steps and the density, says so. Raises `numpy.linalg.LinAlgError` where the precision is not
+    Without `marginal` it is the joint mode of biases and trajectories. `expand` gives the posterior
+    at a point whose tracks it settles first. A step that does not bring its share of what it
+    promises is halved. It ends where `told`, called with the number of steps and the density, says
+    so. Raises `numpy.linalg.LinAlgError` where the precision is not
     positive definite: a flat prior on what no data tell.
     """
 
     def looked(point: Point) -> tuple[Expansion, float]:
         at = expand(point)
-        return at, -at.density() - factors.value(np.asarray(at.point.z))
+        volume = 0.0 if marginal else 0.5 * float(at.eliminated.logdet)
+        return at, -at.density() - volume - factors.value(np.asarray(at.point.z))
+
+    def slope_at(at: Expansion) -> np.ndarray:
+        own = at.score() if marginal else at.slope()
+        return np.asarray(own) + factors.pull(np.asarray(at.point.z))
 
     here, value = looked(start)
     secants: list[tuple[np.ndarray, np.ndarray]] = []
     trace, converged, ended = [-value], False, False
-    slope = _slope(here, factors)
+    slope = slope_at(here)
     while True:
         step = _direction(here, factors, slope, secants)
         promised = 0.5 * float(slope @ step)
@@ -111,7 +117,7 @@ def climb_to_mode(
             converged = promised <= SMALL * abs(value)
             break
         moved, before = np.asarray(there.point.z) - np.asarray(here.point.z), slope
-        slope = _slope(there, factors)
+        slope = slope_at(there)
         if moved @ (before - slope) > LEAST_CURVED * share * (moved @ before):
             secants = [*secants, (moved, before - slope)][-KEPT:]
         here, value = there, after
@@ -130,6 +136,8 @@ def climb_with_noise(
     turns: int,
     tolerance: float,
     told: Callable[[int, float], bool],
+    *,
+    marginal: bool = True,
 ) -> Climbed:
     """Climb in turn to the mode of the biases and, where noise is not known, to that of largest
     evidence.
@@ -140,7 +148,7 @@ def climb_with_noise(
     point, trace = start, [-np.inf]
     while True:
         expand = partial(engine.settled, model)
-        mode = climb_to_mode(expand, point, factors, steps, 1e-2 * tolerance, told)
+        mode = climb_to_mode(expand, point, factors, steps, 1e-2 * tolerance, told, marginal=marginal)
         if not model.learns_noise:
             return mode
         trace.append(evidence(mode.at, prior, factors).value)
@@ -153,11 +161,6 @@ def climb_with_noise(
                 refused=mode.refused and len(trace) == 2,
             )
         model, point = renewed_noise(model, mode.at.point, Variances.of(mode.at, factors))
-
-
-def _slope(at: Expansion, factors: Factors) -> np.ndarray:
-    """Slope (M,) of the log marginal density times factors."""
-    return np.asarray(at.score()) + factors.pull(np.asarray(at.point.z))
 
 
 def _direction(

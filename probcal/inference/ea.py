@@ -311,7 +311,6 @@ class LeastSquares(MAP):
     """
 
     trajectory: str = "joint"
-    engine: str | Engine = "dense"
 
     name: ClassVar[str] = "least squares"
     priors: ClassVar[tuple[type, ...]] = (Flat,)
@@ -321,6 +320,7 @@ class LeastSquares(MAP):
             raise InputError(
                 f'{self.name}(trajectory="{self.trajectory}"): without motion there is the joint mode only'
             )
+        super().__post_init__(form)
 
     def prepare(self, problem: Problem) -> Problem:
         """The problem without motion."""

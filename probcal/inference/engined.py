@@ -1,4 +1,4 @@
-"""A climb from the host to the marginal mode, on any engine, and the answer there.
+"""A climb from the host to the marginal or joint mode, on any engine, and the answer there.
 
 `EA()` and `MAP()` come here where kernels of the dense engine do not climb (`gaussian.choose`).
 """
@@ -29,13 +29,14 @@ from probcal.results.schema import ROPE
 
 
 def climb_on(engine: Engine, method: Any, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
-    """The answer of a climb from the host to the marginal mode, on any engine.
+    """The answer of a climb from the host to the marginal or joint mode, on any engine.
 
     Raises `FitError` where a flat prior leaves no interval, and where memory does not hold it.
     """
     model, first = problem.model, prior.precision(problem.labels, problem.surveyed)
     scales = method.climbs_under(prior).precision(problem.labels, problem.surveyed)
     factors, how = Factors.of(scales), method.integration(problem, prior)
+    marginal = method.integrates_places
     steps = min(CLIMB, method.iterations)
 
     def told(k: int, value: float) -> bool:
@@ -44,13 +45,14 @@ def climb_on(engine: Engine, method: Any, problem: Problem, prior: Prior, start:
 
     def climb(problem: Problem, start: Point) -> Reached:
         turns, tolerance = method.iterations, method.tolerance
-        mode = climb_with_noise(engine, problem.model, start, scales, factors, steps, turns, tolerance, told)
+        settings = (steps, turns, tolerance, told)
+        mode = climb_with_noise(engine, problem.model, start, scales, factors, *settings, marginal=marginal)
         value = float(mode.trace[-1])  # without unknown noise the density
         return Reached(problem.with_mixing(mode.at.model.mixing), mode.at, factors, value, mode)
 
     try:
         end, settled = climb(problem, start), True
-        if model.rests:
+        if model.rests and marginal:
             end, settled = with_places(climb, end, engine, lambda: context.monitor.stopped)
         problem, at, mode = end.problem, end.at, end.state
         worth = evidence(at, scales, factors)
@@ -58,7 +60,7 @@ def climb_on(engine: Engine, method: Any, problem: Problem, prior: Prior, start:
         if how is None:
             posterior = _normal(problem, prior, at, first, worth)
         else:
-            mixed, work = by_propagation(how.form, first, engine, at, context.key, told)
+            mixed, work = by_propagation(how.form, first, engine, at, context.key, told, marginal=marginal)
             posterior = MixturePosterior.of(problem, prior, how.form, first.alpha, mixed, worth.value, work)
             settled = settled and bool(mixed.settled)
     except MemoryError:

@@ -75,8 +75,6 @@ class Maximiser(Iterated, ABC):
 
     def lacking(self, prior: Prior, starts: int) -> str:
         """What such a climb takes in the place of what was asked; empty where it does that."""
-        if not self.integrates_places:
-            return 'trajectory="marginal" alone'
         if estimates(self.engine) and not isinstance(prior, (Gaussian, Flat)):
             return "precisions that are given (MAP() with Gaussian() or Flat())"
         if not isinstance(self.climbs_under(prior), (Gaussian, Flat)):
