@@ -655,7 +655,7 @@ def test_check_of_a_large_network_says_what_is_open(monkeypatch, capsys, tmp_pat
     monkeypatch.setattr("probcal.cli.check.MANY", 10)
     monkeypatch.setattr("probcal.cli.check.SHOWN", 5)
     given = {"side": 3, "targets": 1, "epochs": 40}
-    outputs = Outputs(tmp_path, ("check.nc", "check.csv"))
+    outputs = Outputs(tmp_path, ("check.nc", "check.csv", "check.png"))
     ended = check.run(Path(__file__).parents[1] / "models" / "large_network.py", None, (), given, None, outputs)
     said = capsys.readouterr().out
     assert ended == 1
