@@ -419,7 +419,7 @@ def test_a_fit_that_is_no_answer_determines_nothing(judged):
     verdicts = out["verdict"].to_dataset()
     assert out["finding"]["kind"].values.tolist() == ["status"]
     assert "determined" not in verdicts["verdict"].values
-    assert "which is no answer" in str(verdicts["reason"].sel(bias_label="north.heading").values)
+    assert "its interval is not valid" in str(verdicts["reason"].sel(bias_label="north.heading").values)
 
 
 def test_nothing_is_nan_and_the_tree_is_a_copy(judged, tmp_path):

@@ -407,7 +407,7 @@ def test_status_follows_the_gravest():
         ("converged", "estimated", "determined", "the data narrow its"),
         ("converged", "pruned", "weak", "its precision was maximised"),
         ("converged", "not mixed", "weak", "its chains have not mixed"),
-        ("not converged", "estimated", "weak", "the fit ended not converged, which is no answer"),
+        ("not converged", "estimated", "weak", "the fit ended not converged: its interval is not valid"),
         ("at bound", "estimated", "weak", "the fit ended at bound"),
         ("diverged", "estimated", "weak", "the fit ended diverged"),
         ("misfit", "estimated", "conflicting", "model and data contradict each other"),

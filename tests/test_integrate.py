@@ -155,8 +155,9 @@ def test_expectation_propagation_agrees_too(prior, members):
     members = np.array(members)
     form = Form(3, kind_of(prior))
     with jax.enable_x64(True):
-        likelihood = BiasLikelihood(None, HandMade(), Factors(), whole=True)
-        work = Propagation.of(form, Precision(jnp.ones(3)), likelihood, members, jax.random.key(0))
+        first = form.rest(Precision(jnp.ones(3)))  # flat: every bias has a site
+        likelihood = BiasLikelihood(None, HandMade(), Factors.of(first), whole=True)
+        work = Propagation.of(form, first, likelihood, members, jax.random.key(0))
         for turn in range(ROUNDS):
             off = work.round(turn)
         z, blocks = joint_draws(work)

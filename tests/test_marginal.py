@@ -15,6 +15,7 @@ from probcal.errors import InputError
 from probcal.gaussian.linearised import laplace
 from probcal.gaussian.marginal import _damped, find_marginal_mode, volume_slope
 from probcal.gaussian.mode import DAMPING, cost, eliminate, find_mode
+from probcal.gaussian.search import HALVINGS, between, halved
 from probcal.geometry import bearing
 from probcal.modes import automatic_start
 from probcal.priors import Precision
@@ -72,6 +73,16 @@ def test_on_a_linear_problem_it_is_the_joint_mode():
     assert bool(marginal.converged)
     np.testing.assert_allclose(marginal.point.z, joint.point.z, atol=1e-7)
     assert float(evidence) == pytest.approx(float(again), abs=1e-8)
+
+
+def test_steps_are_halved_apart_and_none_is_taken_where_none_would_do():
+    """Of three steps along (t - a)^2 the first is whole, the second an eighth; the third only rises."""
+    valley, bound = jnp.array([0.5, 0.1, -1.0]), jnp.array([0.25, 0.01, 1.0])
+    share, value, tries = halved(lambda t: (t - valley) ** 2, bound)
+    np.testing.assert_array_equal(share, [1.0, 0.125, 0.0])
+    np.testing.assert_allclose(value, [0.25, 0.025**2, 1.0], rtol=1e-6)
+    assert tries == HALVINGS
+    assert between(jnp.ones(()), jnp.nan, share[2]) == 1.0
 
 
 def test_what_it_refuses():

@@ -172,7 +172,7 @@ def _verdicts(
     ended = calibration["status"].values.tolist()
     status = Status(tree.attrs["status"])
     if bent is not None:
-        doubts = dict.fromkeys(range(M), "the answer is far from Gaussian, so its interval is none")
+        doubts = dict.fromkeys(range(M), "the answer is far from Gaussian: its interval is not valid")
 
     def around() -> list[np.ndarray]:  # draws of chains lie on both sides
         return fit.expansion.followed(fit.root)

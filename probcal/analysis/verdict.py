@@ -125,9 +125,9 @@ def judge_biases(
             (far, "weak", elsewhere),
             (m in doubts, "weak", doubts.get(m, "")),
             (m in shared, "weak", f"it belongs to {shared.get(m)}, which the data leave open"),
-            (not status.settled, "weak", f"the fit ended {status}, which is no answer"),
-            (ended[m] == "not mixed", "weak", "its chains have not mixed, which is no answer"),
-            (ended[m] == "pruned", "weak", "pruned: its precision was maximised, and its interval is none"),
+            (not status.settled, "weak", f"the fit ended {status}: its interval is not valid"),
+            (ended[m] == "not mixed", "weak", "its chains have not mixed: its interval is not valid"),
+            (ended[m] == "pruned", "weak", "pruned: its precision was maximised, so its interval is not valid"),
             (True, "determined", f"the data narrow its {sizes}"),
         )
         verdict, reason = next((verdict, reason) for holds, verdict, reason in cases if holds)

@@ -87,7 +87,8 @@ def simulated(at: Expansion, pulls: Sequence[Any], key: jax.Array) -> list[tuple
 
     `pulls` (E, n, D) are added to the scores of the states.
     """
-    return _simulated(at.model, at.eliminated, [(own.L, own.half) for own in at.given_biases()], pulls, key)
+    given = [(own.L, own.half) for own in at.given_biases()]
+    return _simulated(at.model, at.eliminated, given, tuple(pulls), key)
 
 
 @jax.jit

@@ -75,8 +75,10 @@ def conclude(
 
 
 def diverged(problem: Problem, at: Expansion, factors: Factors) -> FitError:
-    """What to say where the precision at a point with the factors of a prior is not positive
-    definite."""
+    """The error that the precision of the biases is not positive definite.
+
+    It names the biases that no row informs.
+    """
     told = np.append(np.zeros(problem.model.biases), 0.0)
     for *_, read, lin in problem.model.each_block(problem.model.read, at.rows):
         own = np.einsum("ncp,nc->np", np.asarray(lin.bias) ** 2, np.asarray(lin.weight))

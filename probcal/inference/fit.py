@@ -170,7 +170,7 @@ def _interrupted(answer: Answer, monitor: Monitor) -> Answer:
 
 
 def _directions(answer: Answer) -> tuple[tuple[Direction, ...], int]:
-    """What the data leave open where the answer stands, and how many directions that are; some may have no name."""
+    """The directions that the data leave open at the answer, and their number; some have no name."""
     posterior, information = answer.posterior, answer.posterior.summary.information
     if (blocks := posterior.declared) is not None:
         if not answer.prior.proper:  # a flat prior leaves no room for more

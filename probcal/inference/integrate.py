@@ -143,9 +143,9 @@ def by_propagation(
     *,
     marginal: bool = True,
 ) -> tuple[Integrated, Propagation]:
-    """What expectation propagation leaves, which keeps no draws of the hyper-parameters, and where it ended.
+    """The posterior by expectation propagation, and the propagation where it ended.
 
-    `first` is the prior of what no hierarchy governs, `at` where the climb ended.
+    It keeps no draws of the hyper-parameters. `first` is the prior of what no hierarchy governs, `at` where the climb ended.
     """
     first = form.rest(first)
     known = BiasLikelihood.of(engine, at, Factors.of(first), marginal=marginal)
