@@ -145,7 +145,8 @@ def by_propagation(
 ) -> tuple[Integrated, Propagation]:
     """The posterior by expectation propagation, and the propagation where it ended.
 
-    It keeps no draws of the hyper-parameters. `first` is the prior of what no hierarchy governs, `at` where the climb ended.
+    It keeps no draws of the hyper-parameters. `first` is the prior of what no hierarchy governs,
+    `at` where the climb ended.
     """
     first = form.rest(first)
     known = BiasLikelihood.of(engine, at, Factors.of(first), marginal=marginal)
