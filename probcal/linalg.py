@@ -143,14 +143,13 @@ def forward(root: jax.Array, right: jax.Array) -> jax.Array:
     return jnp.stack(solved, 1)
 
 
-def semi_solve(matrices: jax.Array, right: jax.Array) -> jax.Array:
-    """Solutions x (E, n, m) of positive semi-definite systems (E, n, n) x = right in their range.
+def semi_solve(root: jax.Array, right: jax.Array) -> jax.Array:
+    """Solutions x (E, n, m) of positive semi-definite systems of these roots (E, n, n) in their range.
 
     Where a pivot is lost in rounding the entry of x is zero.
     """
-    root = semi_cholesky(matrices)
     y = forward(root, right)
-    n = matrices.shape[-1]
+    n = root.shape[-1]
     pivots = jnp.diagonal(root, axis1=1, axis2=2)
     there = pivots > 0
     x = jnp.zeros_like(y)

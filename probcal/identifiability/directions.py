@@ -219,9 +219,9 @@ def _strongest(
     problem: Problem, anchors: tuple[tuple[str, ...], ...], vector: np.ndarray
 ) -> tuple[tuple[str, ...], ...]:
     """The free biases of groups of which one is to be fixed, those groups that a direction (M,) moves most."""
-    free = {label for label, own in zip(problem.labels, problem.surveyed, strict=True) if not own}
+    free = {label: m for m, label in enumerate(problem.labels) if not problem.surveyed[m]}
     groups = [tuple(label for label in group if label in free) for group in anchors]
-    moved = {group: sum(vector[problem.labels.index(label)] ** 2 for label in group) for group in groups if group}
+    moved = {group: sum(vector[free[label]] ** 2 for label in group) for group in groups if group}
     return tuple(sorted(moved, key=lambda group: -moved[group])[:TRIED])
 
 

@@ -12,10 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.gaussian.linearised import linearise_rows
 from probcal.gaussian.mode import Point, compress
 from probcal.linalg import orthogonalise, spectrum
 from probcal.model import variants
 from probcal.model.model import Model
+from probcal.model.rows import Linearised
 from probcal.motion import Known, as_motion
 from probcal.problem import Problem
 
@@ -25,11 +27,11 @@ HELD = 1e30  # precision of a state that is known
 ENOUGH = 0.5  # share of the data in epochs with more data than unknowns from which on a gauge can be counted
 
 
-class FreeStates(NamedTuple):
-    """Information (M, M) of the biases with the states of every epoch free, and with them known; ranks by epoch."""
+class Within(NamedTuple):
+    """What combinations (M, k) of the biases say with the states of every epoch free."""
 
-    information: jax.Array
-    known: jax.Array
+    left: jax.Array  # (k, k) information about them
+    known: jax.Array  # (k,) the same with the states known
     ranks: tuple[jax.Array, ...]  # (E,) unknowns that the data of an epoch fix
 
 
@@ -41,35 +43,33 @@ class Gauge(NamedTuple):
 
 
 @jax.jit
-def free_states(model: Model, point: Point, hold: tuple[jax.Array, ...]) -> FreeStates:
-    """Information about the biases with the state of every epoch free but for the precisions `hold` (E, n)."""
-    lins = model.linearise(point, expected=True)
+def free_states(model: Model, lins: tuple[Linearised, ...], hold: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+    """Information (M, M) about the biases with the states free but for the precisions `hold` (E, n), and with them
+    known."""
     compressed = compress(model, lins)
-    known = information = compressed.information
-    ranks = []
+    information = compressed.information
     for _, (J, _), cross, precision in model.each_layout(compressed.states, compressed.crosses, hold):
         root = linalg.semi_cholesky(J + jax.vmap(jnp.diag)(precision))
-        flat = linalg.forward(root, cross).reshape(-1, cross.shape[2])
-        information = information - linalg.gram(flat)
-        ranks.append(jnp.sum((jnp.diagonal(root, axis1=1, axis2=2) > 0) & (precision < HELD), 1))
-    return FreeStates(information, known, tuple(ranks))
+        information = information - linalg.gram(linalg.forward(root, cross).reshape(-1, cross.shape[2]))
+    return information, compressed.information
 
 
 @jax.jit
-def within(model: Model, point: Point, hold: tuple[jax.Array, ...], basis: jax.Array) -> jax.Array:
-    """Information (k, k) of combinations (M, k) with free states, from the residuals of rows: no cancellation."""
-    lins = model.linearise(point, expected=True)
-    pulled = tuple(lin.weight[:, :, None] * own for lin, own in zip(lins, model.by_bias(lins, basis), strict=True))
-    moved = [
-        linalg.semi_solve(J + jax.vmap(jnp.diag)(precision), column)
-        for (J, _), column, precision in zip(model.of_states(lins), model.onto_states(lins, pulled), hold, strict=True)
-    ]
-    total = jnp.zeros((basis.shape[1], basis.shape[1]))
-    for lin, left in zip(lins, model.responses(lins, [-x for x in moved], basis), strict=True):
-        total = total + jnp.einsum("nck,nc,ncl->kl", left, lin.weight, left)
-    for x, precision in zip(moved, hold, strict=True):
-        total = total + jnp.einsum("enk,en,enl->kl", x, precision, x)
-    return total
+def within(model: Model, lins: tuple[Linearised, ...], hold: tuple[jax.Array, ...], basis: jax.Array) -> Within:
+    """Information about combinations (M, k) with free states, from the residuals of rows: no cancellation."""
+    own = model.by_bias(lins, basis)
+    pulled = tuple(lin.weight[:, :, None] * row for lin, row in zip(lins, own, strict=True))
+    left, known, moved, ranks = jnp.zeros((basis.shape[1],) * 2), jnp.zeros(basis.shape[1]), [], []
+    for (J, _), column, precision in zip(model.of_states(lins), model.onto_states(lins, pulled), hold, strict=True):
+        root = linalg.semi_cholesky(J + jax.vmap(jnp.diag)(precision))
+        ranks.append(jnp.sum((jnp.diagonal(root, axis1=1, axis2=2) > 0) & (precision < HELD), 1))
+        x = linalg.semi_solve(root, column)
+        left = left + jnp.einsum("enk,en,enl->kl", x, precision, x)
+        moved.append(-x)
+    for lin, alone, response in zip(lins, own, model.responses(lins, moved, basis), strict=True):
+        known = known + jnp.einsum("nck,nc,nck->k", alone, lin.weight, alone)
+        left = left + jnp.einsum("nck,nc,ncl->kl", response, lin.weight, response)
+    return Within(left, known, tuple(ranks))
 
 
 def held_states(problem: Problem) -> tuple[jax.Array, ...]:
@@ -100,42 +100,24 @@ def gauge(problem: Problem, point: Point) -> Gauge:
     as with one range at a time, `countable` is False: what is fixed there hangs on the motion.
     """
     model, hold = problem.model, held_states(problem)
-    free = free_states(model, point, hold)
-    survey = problem.surveyed.astype(float)
-    information = np.asarray(free.information) + np.diag(survey)
-    alone = np.diag(np.asarray(free.known)) + survey
+    lins, survey = linearise_rows(model, point), problem.surveyed.astype(float)
+    free, known = (np.asarray(part) for part in free_states(model, lins, hold))
+    information, alone = free + np.diag(survey), np.diag(known) + survey
     unit = 1 / np.sqrt(np.where(alone > 0, alone, 1.0))
     values, vectors = spectrum(information * np.outer(unit, unit))
     near = unit[:, None] * vectors[:, values < CLOSE]
-    exact = np.asarray(within(model, point, hold, jnp.asarray(near))) + near.T @ (survey[:, None] * near)
+    found = within(model, lins, hold, jnp.asarray(near))
+    exact = np.asarray(found.left) + near.T @ (survey[:, None] * near)
     values, turned = spectrum(0.5 * (exact + exact.T))
-    return Gauge(orthogonalise(near @ turned[:, values < NULL]), _countable(problem, free.ranks))
-
-
-@jax.jit
-def beside_free_states(
-    model: Model, point: Point, hold: tuple[jax.Array, ...], basis: jax.Array
-) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-    """Information (k,) of combinations (M, k) with the states known, and the ranks of `FreeStates`."""
-    lins = model.linearise(point, expected=True)
-    known = jnp.zeros(basis.shape[1])
-    for lin, own in zip(lins, model.by_bias(lins, basis), strict=True):
-        known = known + jnp.einsum("nck,nc,nck->k", own, lin.weight, own)
-    ranks = []
-    for (J, _), precision in zip(model.of_states(lins), hold, strict=True):
-        root = linalg.semi_cholesky(J + jax.vmap(jnp.diag)(precision))
-        ranks.append(jnp.sum((jnp.diagonal(root, axis1=1, axis2=2) > 0) & (precision < HELD), 1))
-    return known, tuple(ranks)
+    return Gauge(orthogonalise(near @ turned[:, values < NULL]), _countable(problem, found.ranks))
 
 
 def unfixed(problem: Problem, point: Point, vectors: np.ndarray) -> np.ndarray:
     """Which of some combinations (M, k) no row fixes: each by itself, where the biases are too many for `gauge`."""
-    hold, basis = held_states(problem), jnp.asarray(vectors)
-    known, ranks = beside_free_states(problem.model, point, hold, basis)
+    found = within(problem.model, linearise_rows(problem.model, point), held_states(problem), jnp.asarray(vectors))
     survey = (problem.surveyed[:, None] * vectors**2).sum(0)
-    left = np.diagonal(np.asarray(within(problem.model, point, hold, basis))) + survey
-    share = left / np.maximum(np.asarray(known) + survey, np.finfo(float).tiny)
-    return (share < CLOSE) & _countable(problem, ranks)
+    left, known = np.diagonal(np.asarray(found.left)) + survey, np.asarray(found.known) + survey
+    return (left < CLOSE * np.maximum(known, np.finfo(float).tiny)) & _countable(problem, found.ranks)
 
 
 def _countable(problem: Problem, ranks: Sequence[jax.Array]) -> bool:
