@@ -28,7 +28,7 @@ ENOUGH = 0.5  # share of the data in epochs with more data than unknowns from wh
 
 
 class Within(NamedTuple):
-    """What combinations (M, k) of the biases say with the states of every epoch free."""
+    """Combinations (M, k) of the biases with the states of every epoch free."""
 
     left: jax.Array  # (k, k) information about them
     known: jax.Array  # (k,) the same with the states known
@@ -50,13 +50,14 @@ def free_states(model: Model, lins: tuple[Linearised, ...], hold: tuple[jax.Arra
     information = compressed.information
     for _, (J, _), cross, precision in model.each_layout(compressed.states, compressed.crosses, hold):
         root = linalg.semi_cholesky(J + jax.vmap(jnp.diag)(precision))
-        information = information - linalg.gram(linalg.forward(root, cross).reshape(-1, cross.shape[2]))
+        flat = linalg.forward(root, cross).reshape(-1, cross.shape[2])
+        information = information - linalg.gram(flat)
     return information, compressed.information
 
 
 @jax.jit
 def within(model: Model, lins: tuple[Linearised, ...], hold: tuple[jax.Array, ...], basis: jax.Array) -> Within:
-    """Information about combinations (M, k) with free states, from the residuals of rows: no cancellation."""
+    """Information about combinations with free states, from the residuals of rows: no cancellation."""
     own = model.by_bias(lins, basis)
     pulled = tuple(lin.weight[:, :, None] * row for lin, row in zip(lins, own, strict=True))
     left, known, moved, ranks = jnp.zeros((basis.shape[1],) * 2), jnp.zeros(basis.shape[1]), [], []
