@@ -3,8 +3,7 @@
 Steps of an algorithm use the positive step weight; covariance, gamma and evidence use the expected
 information (for a Student-t the two differ).
 To add a family, write a frozen dataclass that inherits `AdditiveNoise` with its density and how it is drawn. To let it
-drive a motion too, write the methods of `ScaleMixture`: a vector of noise is then normal given a precision drawn anew
-at every epoch.
+drive a motion too, write the methods of `ScaleMixture`: noise is then normal given a precision drawn at every epoch.
 """
 
 from collections.abc import Mapping
@@ -221,8 +220,8 @@ class ScaleMixture(Protocol):
     def mixing_information(self, size):
         """Fisher information of each entry of u about its place, over that of unit normals."""
 
-    def mixing_draw(self, key, shape):
-        """Draws of w."""
+    def mixing_draw(self, key, shape, square=0.0, size=0):
+        """Draws of w, given u where its square is given."""
 
 
 class AdditiveNoise:
@@ -647,9 +646,9 @@ class StudentT(AdditiveNoise):
         """(df + size) / (df + size + 2)."""
         return (self.df + size) / (self.df + size + 2.0)
 
-    def mixing_draw(self, key, shape):
-        """Chi-square of df degrees of freedom over df."""
-        return jax.random.gamma(key, 0.5 * self.df, shape) / (0.5 * self.df)
+    def mixing_draw(self, key, shape, square=0.0, size=0):
+        """Chi-square of df + size degrees of freedom over df + square."""
+        return jax.random.gamma(key, 0.5 * (self.df + size), shape) / (0.5 * (self.df + square))
 
 
 def _late_normal(x, scale):
@@ -822,9 +821,10 @@ class Mixture(AdditiveNoise):
         weight = kept + (1 - kept) / self.scale**2
         return float(np.trapezoid(np.exp(np.logaddexp(inlier, wide) + constant) * weight**2 * square, radius) / size)
 
-    def mixing_draw(self, key, shape):
-        """One, or 1 / scale^2 with the probability of the share."""
-        return jnp.where(jax.random.uniform(key, shape) < self.share, self.scale**-2.0, 1.0)
+    def mixing_draw(self, key, shape, square=0.0, size=0):
+        """One with the probability of an inlier, else 1 / scale^2."""
+        kept = jax.nn.sigmoid(jnp.subtract(*self._often(square, size)))
+        return jnp.where(jax.random.uniform(key, shape) >= kept, self.scale**-2.0, 1.0)
 
 
 SMALLEST = 1e-9  # weight of a datum that says nothing, times std^2

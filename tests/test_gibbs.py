@@ -1,5 +1,6 @@
 """Gibbs sampling by split HMC: exact on linear worlds by both engines, as the collapsed sampler elsewhere."""
 
+from functools import cache
 from unittest.mock import patch
 
 import jax
@@ -8,17 +9,19 @@ import numpy as np
 import pandas as pd
 import pytest
 import worlds
-from sparse_worlds import LIBRARIES, drawn, drawn_in_space, loud_ear
+from scipy import stats
+from sparse_worlds import LIBRARIES, drawn, drawn_in_space, loud
 
 import probcal as pc
 from probcal.errors import InputError
 from probcal.gaussian.choose import direct_engine
 from probcal.gaussian.dense import DenseEngine
-from probcal.gaussian.mode import log_density
+from probcal.gaussian.mode import Point, driven_states, log_density
 from probcal.geometry import norm
 from probcal.inference import calibrate
 from probcal.inference.joint_gibbs import Gibbs, _Sweeps
 from probcal.inference.method import Context
+from probcal.inference.noise_step import draw_noise, levels_alone
 from probcal.inference.solve import solve
 from probcal.inference.split_hmc import Reference, SplitGaussian, placed, split_variables, variables_of
 from probcal.modes import automatic_start
@@ -353,17 +356,66 @@ def test_what_it_does_not_take_is_said():
     problem = drawn()[0]
     with pytest.raises(InputError, match="Gibbs takes one start: its chains begin at different draws"):
         pc.fit(problem, Gibbs(), starts=2)
-    with pytest.raises(InputError, match=r"Gibbs\(\) takes a prior without correlations"):
-        pc.fit(problem, Gibbs(), prior=pc.Gaussian(correlation={"b.position_*": 0.5}))
     with pytest.raises(InputError, match="Gibbs does not take the prior BernoulliGaussian"):
         pc.fit(problem, Gibbs(), prior=pc.BernoulliGaussian())
     with pytest.raises(InputError, match=r"Gibbs\(chains=0\): it must be at least 1"):
         Gibbs(chains=0)
-    nodes = [pc.Node(name, place, scale={"heading": 0.05}) for name, place in (("p", (0.0, 0.0)), ("q", (300.0, 0.0)))]
-    network, motion = pc.Network([loud_ear.on(node) for node in nodes]), pc.ConstantVelocity(1.0)
-    run = pc.simulate(network, motion, np.arange(5.0), key=0)
-    with pytest.raises(InputError, match=r"Gibbs\(\) does not take unknown noise levels: take Collapsed\(\) or NUTS"):
-        pc.fit(pc.Problem(network, motion, run.table), Gibbs())
+
+
+@pc.sensor(range=pc.Channel("m", std=pc.Unknown(1.0), noise=pc.noise.Mixture(pc.Unknown(0.2, 2.0), 8.0)))
+def echoing(target, pose, *, offset=pc.Bias("m", 1.0)):
+    """Range of unknown noise with an unknown share of echoes."""
+    return dict(range=norm(target.position - pose.position) + offset)
+
+
+@cache
+def echoes():
+    """Two sensors with echoes and a walk of known noise."""
+    network = pc.Network([echoing.on(pc.Node(name, (x, 0.0))) for name, x in (("a", 0.0), ("b", 90.0))])
+    run = pc.simulate(network, pc.ConstantVelocity(1.0), np.arange(10.0), key=0, tracks={"t": np.full((10, 2), 40.0)})
+    return pc.Problem(network, pc.ConstantVelocity(1.0), run.table)
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize(("made", "single"), [(loud, 1), (echoes, 1)])
+def test_a_step_of_the_noise_leaves_the_joint_density_alone(made, single):
+    """Levels, noises and data are drawn from the model, then the levels given the rest: they have their prior."""
+    model = made().model
+    with jax.enable_x64(True):
+        point, alone = automatic_start(made()), levels_alone(model)
+
+        @jax.jit
+        @jax.vmap
+        def after(key):
+            keys = jax.random.split(key, 4)
+            levels = model.level_spread * jax.random.normal(keys[0], model.level_spread.shape)
+            noises = tuple(model.draw_noises(keys[1], r, 1)[:, :, 0] for r in range(len(model.recursions)))
+            states = model.each(lambda part, u: driven_states(part, levels, u), noises)
+            at = Point(states, noises, point.z, levels)
+            given = model.with_values(model.sample(at, keys[2]))
+            changed, drawn = draw_noise(given, at, keys[3], alone)
+            again = changed.each(lambda part, u: driven_states(part, drawn.levels, u), drawn.noises)
+            return levels, drawn.levels, jax.tree.leaves(changed.mixing), again[0] - drawn.states[0]
+
+        before, levels, weights, apart = jax.tree.map(np.asarray, after(jax.random.split(jax.random.key(0), 400)))
+    assert len(alone) == single, "the std of the motion, and the share of echoes"
+    for h, spread in enumerate(np.asarray(model.level_spread)):
+        assert stats.kstest(levels[:, h] / spread, "norm").pvalue > 1e-3
+        assert np.abs(levels[:, h] - before[:, h]).max() > 0.1
+    assert all(stats.kstest(4.0 * own[:, 3], stats.chi2(4).cdf).pvalue > 1e-3 for own in weights)
+    assert np.abs(apart).max() < 1e-6
+
+
+def test_correlated_surveys_have_their_exact_posterior():
+    """Of a linear world: means and sds within 5 standard errors of those of the mode."""
+    problem, start = worlds.linear("plane")[0], worlds.resting(worlds.linear("plane")[0])
+    prior = pc.Gaussian(correlation={"a.position_*": -0.7})
+    ours, exact = (
+        calibrate(problem, method, prior=prior, start=start)[0]["calibration"].to_dataset()
+        for method in (Gibbs(chains=2, warmup=0, draws=250, patience=1), pc.MAP())
+    )
+    np.testing.assert_allclose((ours["mean"] - exact["mean"]) / exact["sd"], 0.0, atol=5 * 1.1 / np.sqrt(500))
+    np.testing.assert_allclose(ours["sd"] / exact["sd"], 1.0, atol=5 * 1.1 / np.sqrt(1000))
 
 
 @pytest.mark.ci
@@ -371,7 +423,7 @@ def test_memory_that_does_not_hold_a_factor_is_said(monkeypatch):
     def refused(*_):
         raise MemoryError
 
-    monkeypatch.setattr("probcal.inference.joint_gibbs.climb_to_mode", refused)
+    monkeypatch.setattr("probcal.inference.joint_gibbs.climb_with_noise", refused)
     with pytest.raises(pc.FitError, match="does not fit in memory: take fewer sensors or a shorter time"):
         pc.fit(drawn()[0], Gibbs(**SHORT))
 

@@ -84,8 +84,3 @@ def test_methods_agree_on_biases_and_parameters(name, method):
         both = (logs, answered(name, EXACT[0])[-1])
         error = np.hypot(*(own.std((0, 1)) / np.sqrt(mixing(own)["ess"]) for own in both))
         assert (np.abs(both[0].mean((0, 1)) - both[1].mean((0, 1))) < 4 * error).all()
-
-
-def test_gibbs_refuses_unknown_parameters():
-    with pytest.raises(pc.InputError, match=r"Gibbs\(\) does not take unknown noise levels: take Collapsed"):
-        pc.fit(walk("late"), pc.Gibbs())

@@ -15,6 +15,7 @@ from probcal.errors import InputError
 from probcal.gaussian.frame import log_weight
 from probcal.inference.chains import Sample
 from probcal.inference.framed import FramedSampler
+from probcal.inference.gibbs import draw_hyper
 from probcal.inference.hierarchy import Phi
 from probcal.inference.leaps import Place, leap
 from probcal.inference.orbits import roam
@@ -139,9 +140,7 @@ class Collapsed(FramedSampler):
         at, rate = leap(
             form, posed, self.place(form, posed, chain), keys[0], LEAPS, self.sweeps or form.hierarchy.sweeps
         )
-        phi, learnt = at.phi, jnp.asarray(form.hierarchy.learnt, int)
-        for k, update in enumerate(form.hierarchy.updates()):
-            phi = update(phi, at.theta[learnt], jax.random.fold_in(keys[1], k))
+        phi = draw_hyper(form, at.phi, at.theta, keys[1])
         given = conditional(form, posed, phi)
         theta, eps, weight, swung = hmc_step(form, posed, chain._replace(**at._asdict()), given, keys[2])
         at, roamed = roam(form, posed, Place(theta, eps, phi, weight), keys[3])

@@ -22,17 +22,21 @@ def inverse_gaussian(key: jax.Array, mean: jax.Array, shape: float) -> jax.Array
 
 
 def slice_step(key: jax.Array, x: jax.Array, density: Callable[[jax.Array], jax.Array]) -> jax.Array:
-    """One slice-sampling update of a scalar under a log density (Neal 2003: stepping out, shrinkage)."""
+    """One slice-sampling update of independent variables x, each under its own log density (Neal
+    2003: stepping out, shrinkage)."""
     keys = jax.random.split(key, 4)
-    level = density(x) - jax.random.exponential(keys[0])
-    low = x - WIDTH * jax.random.uniform(keys[1])
-    below = jax.random.randint(keys[2], (), 0, WIDENINGS + 1)  # how many of the widenings may go down
+    level = density(x) - jax.random.exponential(keys[0], x.shape)
+    low = x - WIDTH * jax.random.uniform(keys[1], x.shape)
+    below = jax.random.randint(keys[2], x.shape, 0, WIDENINGS + 1)  # how many of the widenings may go down
 
     def widen(start: jax.Array, step: float, most: jax.Array) -> jax.Array:
-        def outside(state: tuple[jax.Array, jax.Array]) -> jax.Array:
-            return (state[1] < most) & (density(state[0]) > level)
+        def further(state: Any) -> Any:
+            end, count, _ = state
+            end = jnp.where(inside := (count < most) & (density(end) > level), end + step, end)
+            return end, count + 1, jnp.any(inside)
 
-        return jax.lax.while_loop(outside, lambda s: (s[0] + step, s[1] + 1), (start, jnp.zeros_like(most)))[0]
+        first = (start, jnp.zeros((), int), jnp.ones((), bool))
+        return jax.lax.while_loop(lambda state: state[2], further, first)[0]
 
     high = widen(low + WIDTH, WIDTH, WIDENINGS - below)
     low = widen(low, -WIDTH, below)
@@ -40,10 +44,10 @@ def slice_step(key: jax.Array, x: jax.Array, density: Callable[[jax.Array], jax.
     def shrink(state: Any) -> Any:
         low, high, k, key, at, found = state
         key, draw = jax.random.split(key)
-        at = low + (high - low) * jax.random.uniform(draw)
+        at = jnp.where(found, at, low + (high - low) * jax.random.uniform(draw, x.shape))
         found = density(at) >= level
         return jnp.where(at < x, at, low), jnp.where(at < x, high, at), k + 1, key, at, found
 
-    first = (low, high, jnp.zeros((), int), keys[3], x, jnp.zeros((), bool))
-    last = jax.lax.while_loop(lambda s: ~s[5] & (s[2] < SHRINKINGS), shrink, first)
+    first = (low, high, jnp.zeros((), int), keys[3], x, jnp.zeros(x.shape, bool))
+    last = jax.lax.while_loop(lambda s: ~jnp.all(s[5]) & (s[2] < SHRINKINGS), shrink, first)
     return jnp.where(last[5], last[4], x)

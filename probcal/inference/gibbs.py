@@ -1,12 +1,38 @@
 """Gibbs sweeps on a Gaussian likelihood: what the pilot, the samplers and integrated precisions share."""
 
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Quadratic, draw_given, update_inclusions
+from probcal.priors import Precision
+
+
+@partial(jax.jit, static_argnames="form")
+def draw_hyper(form: Form, phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
+    """Hyper-parameters drawn anew given the biases (M,)."""
+    learnt = jnp.asarray(form.hierarchy.learnt, int)
+    for k, update in enumerate(form.hierarchy.updates()):
+        phi = update(phi, z[learnt], jax.random.fold_in(key, k))
+    return phi
+
+
+@partial(jax.jit, static_argnames="form")
+def precisions(form: Form, phi: Phi, first: Precision) -> jax.Array:
+    """Precisions (M,) of the biases given the hyper-parameters."""
+    return form.hierarchy.alpha(phi, first.alpha)
+
+
+def log_prior_of(form: Form, phi: Phi, first: Precision, z: np.ndarray) -> float:
+    """Log density of biases (M,) and hyper-parameters, that of a flat prior counting as one."""
+    known = first._replace(alpha=precisions(form, phi, first))
+    constant = np.log(2 * np.pi) * np.count_nonzero(known.alpha)
+    own = float(known.log_determinant() - known.square(jnp.asarray(z))) - constant
+    return 0.5 * own + float(form.hierarchy.log_prior(phi))
 
 
 def gibbs_sweep(

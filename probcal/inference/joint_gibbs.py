@@ -1,7 +1,9 @@
 """Gibbs sampling of hyper-parameters, trajectories and biases: full Bayes of a network of any size.
 
-One sweep: hyper-parameters given the biases, by their conjugate updates; then all trajectories and biases at once given
-those, by split HMC (`split_hmc.py`) about an expansion of the engine that suits the size.
+One sweep: hyper-parameters given the biases, by their conjugate updates; unknown levels and latent
+scales of the noise given trajectories and biases (`noise_step.py`); then all trajectories and biases
+at once given those, by split HMC (`split_hmc.py`) about an expansion of the engine that suits the
+size.
 """
 
 from __future__ import annotations
@@ -19,14 +21,17 @@ import numpy as np
 
 from probcal.errors import FitError, InputError
 from probcal.gaussian.choose import choose_fast
-from probcal.gaussian.climb import climb_to_mode
+from probcal.gaussian.climb import climb_with_noise
 from probcal.gaussian.engine import Engine, Expansion, Factors
+from probcal.gaussian.information import at_levels
 from probcal.gaussian.joint import blocks_of
-from probcal.gaussian.mode import Point, log_density
+from probcal.gaussian.mode import Point, mixed_density
 from probcal.inference.chains import Draw
 from probcal.inference.ending import diverged
+from probcal.inference.gibbs import draw_hyper, log_prior_of, precisions
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.method import Context
+from probcal.inference.noise_step import draw_noise, levels_alone, log_prior_levels
 from probcal.inference.posed import Form, Natural
 from probcal.inference.posterior import Chains, conclude_draws
 from probcal.inference.sampler import Sampler
@@ -47,7 +52,7 @@ NUMBERS = 4_000_000  # most numbers of draws of states, and of hyper-parameters 
 class SweepState(NamedTuple):
     """Where all chains stand, and what they share."""
 
-    at: Any  # (C, n) states and biases
+    at: Any  # (C, n + H) states, biases and log levels
     phi: Any  # (C, ...) of each hyper-parameter
     made: Any  # () sweeps of a chain
     thin: Any  # () of them from one draw to the next
@@ -69,7 +74,9 @@ class _Chain(NamedTuple):
     number: int
     made: int  # sweeps of it
     at: np.ndarray  # (n,)
+    levels: np.ndarray  # (H,)
     phi: Any  # a `Phi`
+    reference: Reference  # under its noise
     rest: float  # of the log density there, beside that of the Gaussian
     rate: float  # of the last turn: how likely it was taken
 
@@ -78,11 +85,12 @@ class _Chain(NamedTuple):
 class Gibbs(Sampler):
     """Exact posterior of biases, hyper-parameters and trajectories, sampled together: for networks of any size.
 
-    Each sweep draws the hyper-parameters given the biases, solves for the Gaussian of all states and biases given
-    those, by sparse factors where the network is large, and moves these together by a Hamiltonian quarter turn about
-    its mean, which splits off the Gaussian (Shahbaba and others 2014): an independent draw where the model is linear,
-    elsewhere kicked as often as it takes to be accepted. Any prior with a density, no correlations; noise levels are
-    known, noises of motions Gaussian.
+    Each sweep draws the hyper-parameters given the biases, and unknown levels and latent scales of
+    the noise given biases and trajectories; it solves for the Gaussian of all states and biases
+    given those, by sparse factors where the network is large, and moves these together by a
+    Hamiltonian quarter turn about its mean, which splits off the Gaussian (Shahbaba and others
+    2014): an independent draw where the model is linear, elsewhere kicked as often as it takes to be
+    accepted. Any prior with a density.
     Of more than four million numbers no draws of states are kept, their means and sds are. Chains run one after the
     other and start at draws under the declared scales, on the side of a mirror that fits best; they do not visit the
     others, which the answer names. Draws that have not mixed are made anew with 4 times as many sweeps from one to the
@@ -105,14 +113,13 @@ class Gibbs(Sampler):
 
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """Draws of the posterior from a start, and what they say."""
-        check_gibbs(problem, prior)
         began = time.perf_counter()
         model, engine = problem.model, choose_fast(problem.model)
         form = Form(model.biases, hierarchy_of(prior, problem))
         first = prior.precision(problem.labels, problem.surveyed)
-        factors = Factors.alone(np.ones(model.biases) if form.hierarchy.learnt else np.asarray(first.alpha))
+        factors = Factors.alone(np.ones(model.biases)) if form.hierarchy.learnt else Factors.of(first)
         try:
-            mode = climb_to_mode(lambda at: engine.settled(model, at), start, factors, CLIMB, 1e-3).at
+            mode = climb_with_noise(engine, model, start, first, factors, CLIMB, CLIMB, 1e-3, lambda *_: False).at
             runs = _Sweeps(self, form, first, engine, mode, context.key)
             drawn, thin, stopped = drawn_by(self, runs, 1, context.monitor, context.storage, context.threads)
             natural = Natural(jnp.zeros((0, 0)), jnp.zeros(0), model.level_spread, first)
@@ -146,42 +153,6 @@ class Gibbs(Sampler):
             )
 
 
-def check_gibbs(problem: Problem, prior: Prior) -> None:
-    """Raise `InputError` naming what `Gibbs` does not take."""
-    model = problem.model
-    lacks = {
-        "unknown noise levels": bool(problem.levels),
-        "process noise that is not Gaussian": model.tailed,
-        "a motion without a linear form": any(form is not None for form in model.sampled),
-    }
-    for what, has in lacks.items():
-        if has:
-            raise InputError(f"Gibbs() does not take {what}: take Collapsed() or NUTS()")
-    if prior.correlation:
-        raise InputError("Gibbs() takes a prior without correlations: take Collapsed(), or leave them out")
-
-
-@partial(jax.jit, static_argnames="form")
-def _updated(form: Form, phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
-    """Hyper-parameters drawn anew given the biases (M,)."""
-    learnt = jnp.asarray(form.hierarchy.learnt, int)
-    for k, update in enumerate(form.hierarchy.updates()):
-        phi = update(phi, z[learnt], jax.random.fold_in(key, k))
-    return phi
-
-
-@partial(jax.jit, static_argnames="form")
-def _precisions(form: Form, phi: Phi, first: Precision) -> jax.Array:
-    return form.hierarchy.alpha(phi, first.alpha)
-
-
-def _log_prior(form: Form, phi: Phi, first: Precision, z: np.ndarray) -> float:
-    """Log density of biases (M,) and hyper-parameters, that of a flat prior counting as one."""
-    alpha = np.asarray(_precisions(form, phi, first))
-    own = np.where(alpha > 0, np.log(np.where(alpha > 0, alpha, 1.0) / (2 * np.pi)) - alpha * z**2, 0.0)
-    return 0.5 * float(np.sum(own)) + float(form.hierarchy.log_prior(phi))
-
-
 class _Sweeps:
     """All chains, one after the other: a library of sparse factors keeps one at a time, and takes all processors for
     it."""
@@ -189,6 +160,7 @@ class _Sweeps:
     def __init__(self, method: Gibbs, form: Form, first: Precision, engine: Engine, mode: Expansion, key: jax.Array):
         self.method, self.form, self.prior, self.engine = method, form, first, engine
         self.mode, self.key, self.model = mode, key, mode.model
+        self.alone, self.coupled = levels_alone(mode.model), Factors.coupled(first)
         self.state: SweepState | None = None  # where the chains stood last
         self._reference: Reference | None = None
         self._last: SplitGaussian | None = None
@@ -202,9 +174,9 @@ class _Sweeps:
 
     def _given(self, reference: Reference, phi: Phi) -> SplitGaussian:
         """What hyper-parameters leave; factorised once where there are none."""
-        alpha, last = np.asarray(_precisions(self.form, phi, self.prior)), self._last
+        alpha, last = np.asarray(precisions(self.form, phi, self.prior)), self._last
         if last is None or last.reference is not reference or not np.array_equal(last.alpha, alpha):
-            self._last = last = SplitGaussian.of(reference, alpha)
+            self._last = last = SplitGaussian.of(reference, alpha, self.coupled)
         return last
 
     def first(self) -> SweepState:
@@ -213,43 +185,42 @@ class _Sweeps:
         key, drawn = jax.random.fold_in(self.key, 1), jax.random.fold_in(self.key, 0)
         reference = self._at(variables_of(self.mode.point.states, self.mode.point.z))
         scales = np.ones(M) if self.form.hierarchy.learnt else np.asarray(self.prior.alpha)
-        wide = SplitGaussian.of(reference, scales)
+        wide = SplitGaussian.of(reference, scales, self.coupled)
         at = wide.mean[None] + np.stack([wide.deviation(jax.random.fold_in(drawn, c)) for c in range(C)])
         phis = [begin(jax.random.fold_in(key, c)) for c in range(C)]
+        phi = phis[0]
         if self.form.hierarchy.learnt:
-            z, phi, total = at[0, -M:], phis[0], np.zeros(M)
+            z, total = at[0, -M:], np.zeros(M)
             for k in range(PILOT):
-                phi = _updated(self.form, phi, jnp.asarray(z), jax.random.fold_in(key, C + k))
+                phi = draw_hyper(self.form, phi, jnp.asarray(z), jax.random.fold_in(key, C + k))
                 given = self._given(reference, phi)
                 z = (given.mean + given.deviation(jax.random.fold_in(drawn, C + k)))[-M:]
                 total += given.mean[-M:] * (2 * k >= PILOT)
             moved = self.mode.moved(total / (PILOT - PILOT // 2) - np.asarray(self.mode.point.z))
             settled = self.engine.settled(self.model, moved).point
             reference = self._at(variables_of(settled.states, settled.z))
-            given = self._given(reference, phi)
-        else:
-            given = wide
+        given = self._given(reference, phi)
         here = given.mean + given.deviation(jax.random.fold_in(drawn, C + PILOT))
-        kicks = self._kicks(given, here, jax.random.fold_in(drawn, C + PILOT + 1))
+        tried = _Chain(0, 0, here, np.asarray(self.mode.point.levels), phi, reference, reference.rest(here)[0], 0.0)
+        kicks = self._kicks(tried, jax.random.fold_in(drawn, C + PILOT + 1))
         stacked = {name: np.stack([np.asarray(phi[name]) for phi in phis]) for name in phis[0]}
         return self._begun(at, stacked, reference.variables, kicks)
 
     def _begun(self, at: np.ndarray, phi: Any, reference: np.ndarray, kicks: int) -> SweepState:
         M, S = self.form.biases, self.model.state_size
-        return SweepState(
-            at, phi, np.array(0), np.array(1), np.zeros(2, int), np.zeros((2, S)), np.zeros((2, S)), np.zeros((2, M)),
-            np.zeros((2, M)), reference, np.array(kicks),
-        )  # fmt: skip
+        levels = np.broadcast_to(self.mode.point.levels, (len(at), len(self.mode.point.levels)))
+        whole, counts = np.concatenate([at, levels], 1), (np.array(0), np.array(1), np.zeros(2, int))
+        sums = np.zeros((2, S)), np.zeros((2, S)), np.zeros((2, M)), np.zeros((2, M))
+        return SweepState(whole, phi, *counts, *sums, reference, np.array(kicks))
 
-    def _kicks(self, given: SplitGaussian, at: np.ndarray, key: jax.Array) -> int:
+    def _kicks(self, chain: _Chain, key: jax.Array) -> int:
         """The fewest kicks with which turns are taken often enough."""
-        rest, _ = given.reference.rest(at)
         for kicks in KICKS:
             rates = []
             for k in range(TRIED):
                 own = jax.random.fold_in(jax.random.fold_in(key, kicks), k)
-                at, rest, rate, _ = given.turned(at, rest, kicks, own)
-                rates.append(rate)
+                chain, _, _ = self._turned(chain, kicks, own, jax.random.fold_in(own, 3))
+                rates.append(chain.rate)
             if np.mean(rates) >= WANTED:
                 break
         return kicks
@@ -270,20 +241,22 @@ class _Sweeps:
             sums = {name: np.stack([np.zeros_like(own[0]), own[0]]) for name, own in sums.items()}
         ends, drawn = list[_Chain](), []
         for c in range(self.method.chains):
-            at, phi = np.asarray(state.at[c]), {name: leaf[c] for name, leaf in state.phi.items()}
-            own = _Chain(c, int(state.made), at, phi, reference.rest(at)[0], 0.0)
+            at, levels = np.split(np.asarray(state.at[c]), [len(reference.variables)])
+            phi = {name: leaf[c] for name, leaf in state.phi.items()}
+            own = _Chain(c, int(state.made), at, levels, phi, reference, reference.rest(at)[0], 0.0)
             parts = []
             for _ in range(self.method.chunk):
                 for _ in range(thin):
-                    own, moments = self._swept(reference, own, int(state.kicks))
+                    own, moments = self._swept(own, int(state.kicks))
                     if thin > 1 or own.made > self.method.warmup:
                         for name, value in moments.items():
                             sums[name][0] += value
-                parts.append(self._draw(reference, own))
+                parts.append(self._draw(own))
             ends.append(own)
             drawn.append(jax.tree.map(lambda *leaves: np.stack(leaves), *parts))
         self.state = state._replace(
-            at=np.stack([own.at for own in ends]), made=np.array(ends[0].made), thin=np.array(thin),
+            at=np.stack([np.append(own.at, own.levels) for own in ends]),
+            made=np.array(ends[0].made), thin=np.array(thin),
             phi={name: np.stack([np.asarray(own.phi[name]) for own in ends]) for name in state.phi},
             **sums,
         )  # fmt: skip
@@ -293,25 +266,50 @@ class _Sweeps:
         """States (E, n) of each recursion; nothing where the draws of all would take too much room."""
         return split_variables(self.model, at)[0] if self.method.keeps_states(self.model) else ()
 
-    def _swept(self, reference: Reference, chain: _Chain, kicks: int) -> tuple[_Chain, dict[str, Any]]:
+    def _swept(self, chain: _Chain, kicks: int) -> tuple[_Chain, dict[str, Any]]:
         """One sweep of a chain, and what is summed over sweeps."""
         states = self.model.state_size
         key = jax.random.fold_in(jax.random.fold_in(self.key, 2 + chain.number), chain.made)
-        phi = _updated(self.form, chain.phi, jnp.asarray(chain.at[states:]), key)
-        given = self._given(reference, phi)
-        at, rest, rate, speed = given.turned(chain.at, chain.rest, kicks, jax.random.fold_in(key, 1))
-        step, variance = at[:states] - reference.variables[:states], given.variances(speed)
+        phi = draw_hyper(self.form, chain.phi, jnp.asarray(chain.at[states:]), key)
+        keys = jax.random.fold_in(key, 1), jax.random.fold_in(key, 2)
+        chain, given, speed = self._turned(chain._replace(phi=phi), kicks, *keys)
+        step, variance = chain.at[:states] - chain.reference.variables[:states], given.variances(speed)
         gamma = 1.0 - given.alpha * variance
         moments = {"summed": 1, "total": step, "square": step**2, "gamma": gamma, "variance": variance}
-        return _Chain(chain.number, chain.made + 1, at, phi, rest, rate), moments
+        return chain._replace(made=chain.made + 1), moments
 
-    def _draw(self, reference: Reference, chain: _Chain) -> Draw:
+    def _turned(
+        self, chain: _Chain, kicks: int, key: jax.Array, noise: jax.Array
+    ) -> tuple[_Chain, SplitGaussian, np.ndarray]:
+        """A chain after steps of its noise and of the rest, the Gaussian of these, and their speed."""
+        chain = self._with_noise(chain, noise) if self.model.learns_noise else chain
+        given = self._given(chain.reference, chain.phi)
+        at, rest, rate, speed = given.turned(chain.at, chain.rest, kicks, key)
+        return chain._replace(at=at, rest=rest, rate=rate), given, speed
+
+    def _with_noise(self, chain: _Chain, key: jax.Array) -> _Chain:
+        """A chain after a step of levels and latent scales, its reference under them."""
+        known = at_levels(self.model, self.mode.point, jnp.asarray(chain.levels))
+        model, point = draw_noise(self.model, placed(self.model, known, chain.at), key, self.alone)
+        there = placed(model, point, chain.reference.variables)
+        reference, at = Reference(self.engine.at(model, there)), variables_of(point.states, point.z)
+        levels, rest = np.asarray(point.levels), reference.rest(at)[0]
+        return chain._replace(at=at, levels=levels, reference=reference, rest=rest)
+
+    def _draw(self, chain: _Chain) -> Draw:
         """What is kept of a chain where it stands."""
         at, z, none = chain.at, chain.at[self.model.state_size :], np.zeros(0)
-        value = reference.log_density(at) + _log_prior(self.form, chain.phi, self.prior, z)
+        value = chain.reference.log_density(at) + log_prior_of(self.form, chain.phi, self.prior, z)
+        value += float(jnp.sum(log_prior_levels(self.model, chain.levels)))
         most = NUMBERS / (self.method.chains * self.method.draws)
         phi = {name: np.asarray(leaf) for name, leaf in chain.phi.items() if np.size(leaf) <= most}
-        fields: dict[str, Any] = {"theta": z, "phi": phi, "gamma": none, "variance": none, "density": np.array(value)}
+        fields: dict[str, Any] = {
+            "theta": np.append(z, chain.levels),
+            "phi": phi,
+            "gamma": none,
+            "variance": none,
+            "density": np.array(value),
+        }
         return Draw(**fields | {"states": self._states(at), "stats": {"acceptance_rate": np.array(chain.rate)}})
 
 
@@ -329,7 +327,9 @@ class GibbsChains(Chains):
         which = 0 if int(state.thin) == run.thin else 1  # a longer run that was interrupted leaves the draws before it
         count, total, square, told, spread = (np.asarray(getattr(state, name))[which] for name in SUMS)
         blocks = SensorBlocks.drawn(z.reshape(-1, M), blocks_of(model), spread / count)
-        at = runs.engine.settled(model, runs.mode.moved(z.mean((0, 1)) - np.asarray(runs.mode.point.z)))
+        near = runs.mode.moved(z.mean((0, 1)) - np.asarray(runs.mode.point.z))
+        known = at_levels(runs.model, near, jnp.asarray(run.levels.mean((0, 1))))
+        at = runs.engine.settled(runs.model, known)
         middle = np.asarray(state.reference)[: model.state_size] + total / count
         sd = np.sqrt(np.maximum(square / count - (total / count) ** 2, 0.0))
         moments = tuple(map(Tracks, split_variables(model, middle)[0], split_variables(model, sd)[0]))
@@ -339,6 +339,8 @@ class GibbsChains(Chains):
         )  # fmt: skip
 
     def log_joint(self, point: Point, phi: Phi) -> float:
-        """Log density of data, noises, biases and hyper-parameters at a point, as it is kept of each draw."""
-        known = _log_prior(self.run.form, phi, self.run.posed.first, np.asarray(point.z))
-        return float(log_density(self.problem.model, point)) + known
+        """Log density of data and all unknowns at a point, as it is kept of each draw."""
+        model = self.problem.model
+        known = log_prior_of(self.run.form, phi, self.run.posed.first, np.asarray(point.z))
+        levels = jnp.sum(log_prior_levels(model, point.levels))
+        return known + float(mixed_density(model, point) + levels)

@@ -12,7 +12,6 @@ from probcal.errors import FitError, InputError
 from probcal.gaussian.choose import choose, choose_fast, engine_of, estimates, factoriser
 from probcal.gaussian.mode import Point
 from probcal.gaussian.room import check_room
-from probcal.inference.joint_gibbs import check_gibbs
 from probcal.inference.method import Context, Method
 from probcal.inference.methods import MAP
 from probcal.inference.progress import Monitor, Stopped
@@ -150,7 +149,6 @@ def _on_engine(problem: Problem, method: Method, prior: Prior, starts: int) -> M
     if method.engined:
         if starts > 1:
             raise InputError(f"{method.name} takes one start: its chains begin at different draws (chains=...)")
-        check_gibbs(problem, prior)
         return method
     if isinstance(method, Maximiser):
         lacks = method.lacking(prior, starts)

@@ -2,7 +2,7 @@
 
 The model is the Gaussian of its linearised rows and the rest. A quarter turn about the mean of the
 Gaussian is an independent draw of that; the rest kicks it on the way, and the Metropolis rule makes
-it exact. Variables are all states, then the biases.
+it exact. Variables are all states, then the biases; noise levels and latent scales are given.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from probcal.gaussian.engine import Expansion, Factors
 from probcal.gaussian.jointly import Variables, covariance_times, times_weights
-from probcal.gaussian.mode import Point, log_density, noises_of
+from probcal.gaussian.mode import Point, mixed_density, noises_of
 from probcal.model.model import At, Model, Recursion
 from probcal.model.rows import Linearised
 
@@ -60,7 +60,7 @@ class Reference:
         return float(value), np.asarray(slope)
 
     def log_density(self, variables: np.ndarray) -> float:
-        """Log density of data and trajectories given the biases."""
+        """Log density of data and whitened noises given the biases, latent scales integrated."""
         return float(_log_density(self.at.model, self.at.point, jnp.asarray(variables)))
 
 
@@ -74,14 +74,14 @@ class SplitGaussian:
     mean: np.ndarray  # (n,)
 
     @classmethod
-    def of(cls, reference: Reference, alpha: np.ndarray) -> SplitGaussian:
-        """The Gaussian that precisions alpha (M,) leave.
+    def of(cls, reference: Reference, alpha: np.ndarray, coupled: Factors | None = None) -> SplitGaussian:
+        """The Gaussian that precisions alpha (M,) leave, and the factors of what is correlated.
 
         Raises `numpy.linalg.LinAlgError` where a bias has neither data nor prior.
         """
         if not (reference.precision + alpha > 0).all():
             raise np.linalg.LinAlgError("a bias has neither data nor prior")
-        at, factors = reference.at, Factors.alone(alpha)
+        at, factors = reference.at, Factors.alone(alpha) + (coupled or Factors())
         z = np.asarray(at.point.z)
         mean = at.moved(at.solve(factors, np.asarray(at.slope()) + factors.pull(z)))
         return cls(reference, alpha, factors, variables_of(mean.states, mean.z))
@@ -129,9 +129,9 @@ class SplitGaussian:
         """Unbiased estimates of the variances (M,) of the biases from a draw (n,) about zero, the rest of each
         given."""
         reference, z = self.reference, drawn[self.reference.at.model.state_size :]
-        own = reference.precision + self.alpha
+        own = reference.precision + self.factors.diagonal(len(z))
         pulled = np.asarray(_precision_times(reference.at.model, reference.at.rows, jnp.asarray(drawn)))
-        return 1.0 / own + (z - (pulled + self.alpha * z) / own) ** 2
+        return 1.0 / own + (z - (pulled - self.factors.pull(z)) / own) ** 2
 
 
 @jax.jit
@@ -169,7 +169,7 @@ placed = jax.jit(_placed)
 
 @jax.jit
 def _log_density(model: Model, point: Point, variables: jax.Array) -> jax.Array:
-    return log_density(model, _placed(model, point, variables))
+    return mixed_density(model, _placed(model, point, variables))
 
 
 @jax.jit
