@@ -38,7 +38,7 @@ def log_prior_of(form: Form, phi: Phi, first: Precision, z: np.ndarray) -> float
 def gibbs_sweep(
     form: Form, posed: Quadratic, theta: jax.Array, phi: Phi, key: jax.Array, *, backwards: bool
 ) -> tuple[jax.Array, Phi]:
-    """Gibbs on the frame: hyper-parameters given the biases, then theta given them; `backwards` in reverse order."""
+    """Gibbs on the frame: hyper-parameters given the biases, then theta given them, or `backwards`."""
     kind = form.hierarchy
     learnt = jnp.asarray(kind.learnt, int)
 
@@ -60,7 +60,7 @@ def gibbs_sweep(
 def reversible_sweeps(
     form: Form, posed: Quadratic, theta: jax.Array, phi: Phi, key: jax.Array, sweeps: int
 ) -> tuple[jax.Array, Phi]:
-    """Some sweeps, all forwards or all backwards by a coin: reversible under the frame's posterior."""
+    """Sweeps, all forwards or all backwards by a coin: reversible under the frame's posterior."""
     keys = jax.random.split(key, sweeps + 1)
 
     def run(backwards: bool) -> Any:
