@@ -39,13 +39,16 @@ PRECISIONS = ("integrated", "maximised")
 
 
 @partial(jax.jit, static_argnames=("prior", "rule"))
+def _with_precisions(prior: Prior, given: Given, state: State, rule: str) -> tuple[State, jax.Array]:
+    """The state with precisions that follow from what the last iteration found, and whether there was none."""
+    fresh, found = jnp.isneginf(state.objective), state.found
+    alpha = learn(prior, given, state.alpha, found.gamma, jnp.diagonal(found.covariance), state.point.z, rule)
+    return state._replace(alpha=jnp.where(fresh, state.alpha, alpha)), fresh
+
+
 def learnt(model: Model, prior: Prior, given: Given, state: State, rule: str) -> tuple[Model, State]:
     """Model and state with precisions and levels that follow from what the last iteration found, if there was one."""
-    fresh = jnp.isneginf(state.objective)
-    alpha = learn(
-        prior, given, state.alpha, state.found.gamma, jnp.diagonal(state.found.covariance), state.point.z, rule
-    )
-    state = state._replace(alpha=jnp.where(fresh, state.alpha, alpha))
+    state, fresh = _with_precisions(prior, given, state, rule)
     return renew_noise(model, state, state.found.covariance, fresh)
 
 

@@ -207,10 +207,14 @@ def renew_noise(model: Model, state: State, covariance: jax.Array, fresh: Any = 
     if not model.learns_noise:
         return model, state
     after, point = renewed_noise(model, state.point, Variances.dense(model, state.point, covariance))
-    point, mixing = jax.tree.map(
-        lambda new, old: jnp.where(fresh, old, new), (point, after.mixing), (state.point, state.mixing)
-    )
+    point, mixing = unless(fresh, (point, after.mixing), (state.point, state.mixing))
     return model.with_mixing(mixing), state._replace(point=point, mixing=mixing)
+
+
+@jax.jit
+def unless(fresh: Any, new: Any, old: Any) -> Any:
+    """A pytree as it was where the state is fresh, else the new one."""
+    return jax.tree.map(lambda new, old: jnp.where(fresh, old, new), new, old)
 
 
 def learn(prior: Prior, given: Given, alpha: jax.Array, gamma: Any, variance: Any, z: jax.Array, rule: str) -> Any:
