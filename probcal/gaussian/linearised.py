@@ -121,9 +121,14 @@ def linearise_rows(model: Model, point: Where) -> tuple[Linearised, ...]:
 
 
 @jax.jit
+def compress_rows(model: Model, z: jax.Array, rows: tuple[Linearised, ...]) -> Compressed:
+    """Linearised rows compressed onto states and biases."""
+    return tilted(model, z, compress(model, rows))
+
+
 def compress_and_eliminate(model: Model, point: Point, rows: tuple[Linearised, ...]) -> tuple[Compressed, Eliminated]:
     """Linearised rows compressed, and the system without its trajectories."""
-    system = tilted(model, point.z, compress(model, rows))
+    system = compress_rows(model, point.z, rows)
     return system, eliminate_compressed(model, point.noises, point.levels, system)
 
 

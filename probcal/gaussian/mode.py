@@ -213,22 +213,41 @@ def eliminate_compressed(
 
     The biases keep information G - B'W^-1 B: Paper B (17) with the covariance of whole trajectories for R-bar.
     """
-    information, score = compressed.information, compressed.score
-    kept, logdet = [], jnp.zeros(())
-    parts = model.each_layout(compressed.states, compressed.crosses, noises)
-    for r, (part, (J, pull), cross, u) in enumerate(parts):
-        L = factors(part, levels)
-        used = model.entries(r)
-        gain = rec.gains(part.F, L, J, used)
-        if joint and used:
-            alone, new = _stacked(rec.innovate(part.F, gain, cross))
-            y, innovation = _stacked(rec.innovate(part.F, gain, pull[:, :, None], -(L @ u[:, :, None])))
+    parts = model.each_layout(compressed.states, compressed.crosses)
+    kept = tuple(
+        Kept(J, pull, cross, _gains(part, levels, J, model.entries(r)))
+        for r, (part, (J, pull), cross) in enumerate(parts)
+    )
+    information, score, logdet = _eliminated(model, noises, levels, compressed[:2], kept, joint)
+    return Eliminated(information, score, compressed.score, logdet, kept)
+
+
+@partial(jax.jit, static_argnames="used")
+def _gains(part: Recursion, levels: jax.Array, J: jax.Array, used: tuple[int, ...]) -> rec.Gains:
+    """The covariance pass of a recursion, a kernel that models with other biases share."""
+    return rec.gains(part.F, factors(part, levels), J, used)
+
+
+@partial(jax.jit, static_argnames="joint")
+def _eliminated(
+    model: Model,
+    noises: tuple[jax.Array, ...],
+    levels: jax.Array,
+    told: tuple[jax.Array, jax.Array],
+    parts: tuple[Kept, ...],
+    joint: bool,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Information and score without the trajectories, and the log determinant of their precision."""
+    (information, score), logdet = told, jnp.zeros(())
+    for r, (part, kept, u) in enumerate(model.each_layout(parts, noises)):
+        if joint and model.entries(r):
+            alone, new = _stacked(rec.innovate(part.F, kept.gain, kept.cross))
+            drift = -(factors(part, levels) @ u[:, :, None])
+            y, innovation = _stacked(rec.innovate(part.F, kept.gain, kept.pull[:, :, None], drift))
             information = information + linalg.gram_less(new, alone)
             score = score + new.T @ innovation[:, 0] - alone.T @ y[:, 0]
-        kept.append(Kept(J, pull, cross, gain))
-        logdet = logdet + gain.logdet
-    information = 0.5 * (information + information.T)
-    return Eliminated(information, score, compressed.score, logdet, tuple(kept))
+        logdet = logdet + kept.gain.logdet
+    return 0.5 * (information + information.T), score, logdet
 
 
 def _stacked(columns: tuple[jax.Array, jax.Array]) -> list[jax.Array]:

@@ -40,7 +40,7 @@ PRECISIONS = ("integrated", "maximised")
 
 @partial(jax.jit, static_argnames=("prior", "rule"))
 def _with_precisions(prior: Prior, given: Given, state: State, rule: str) -> tuple[State, jax.Array]:
-    """The state with precisions that follow from what the last iteration found, and whether there was none."""
+    """The state with precisions that follow from the last iteration, and whether there was none."""
     fresh, found = jnp.isneginf(state.objective), state.found
     alpha = learn(prior, given, state.alpha, found.gamma, jnp.diagonal(found.covariance), state.point.z, rule)
     return state._replace(alpha=jnp.where(fresh, state.alpha, alpha)), fresh

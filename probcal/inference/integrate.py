@@ -155,8 +155,7 @@ def by_propagation(
     swept, here = work.swept, work.likelihood.here
     assert swept is not None
     z, covariance = joint_draws(work)
-    tail = 0.5 * (1.0 - INTERVAL)
-    lower, upper = (quantile(swept.means, swept.sds, share) for share in (tail, 1.0 - tail))
+    lower, upper = interval(swept.means, swept.sds)
     total = Moments(work.mean, covariance, lower, upper, swept.gamma)
     point = work.likelihood.expand(here.moved(work.mean - work.likelihood.z)).point
     return Integrated(point, here.information() if covariance.whole else None, total, z, {}, work.settled), work
@@ -283,21 +282,26 @@ def moments(form: Form, known: Natural, phi: Phi) -> Moments:
     count, mean = means.shape[0], jnp.mean(means, 0)
     covariance = total / count + jnp.cov(means, rowvar=False, bias=True).reshape(total.shape)
     sds = jnp.sqrt(jnp.maximum(variances, 0.0))
-    tail = 0.5 * (1.0 - INTERVAL)
-    lower, upper = (quantile(means, sds, share) for share in (tail, 1.0 - tail))
-    return Moments(mean, covariance, lower, upper, jnp.mean(gammas, 0))
+    return Moments(mean, covariance, *interval(means, sds), jnp.mean(gammas, 0))
 
 
-def quantile(means: jax.Array, sds: jax.Array, share: float) -> jax.Array:
-    """Quantile (M,) of each mixture of Gaussians of means and sds (S, M), by halving a bracket; an atom counts."""
-    width = 10.0 * jnp.max(sds, 0) + 1e-12
+@jax.jit
+def interval(means: jax.Array, sds: jax.Array) -> jax.Array:
+    """Lower and upper end (2, M) of the interval of mixtures of Gaussians of means and sds (S, M).
+
+    By halving a bracket; an atom counts.
+    """
+    width, tail = 10.0 * jnp.max(sds, 0) + 1e-12, 0.5 * (1.0 - INTERVAL)
+    shares = jnp.array([tail, 1.0 - tail])
 
     def half(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         low, high = ends
         at = 0.5 * (low + high)
-        below = jnp.mean(ndtr((at[None] - means) / jnp.maximum(sds, 1e-12)), 0) < share
+        inside = ndtr((at[:, None] - means[None]) / jnp.maximum(sds, 1e-12)[None])
+        below = jnp.mean(inside, 1) < shares[:, None]
         return jnp.where(below, at, low), jnp.where(below, high, at)
 
-    low, high = jax.lax.fori_loop(0, HALVINGS, half, (jnp.min(means, 0) - width, jnp.max(means, 0) + width))
+    first = jnp.min(means, 0) - width, jnp.max(means, 0) + width
+    low, high = jax.lax.fori_loop(0, HALVINGS, half, tuple(jnp.stack([end, end]) for end in first))
     found = 0.5 * (low + high)
     return jnp.where(jnp.abs(found) < ATOM, 0.0, found)
