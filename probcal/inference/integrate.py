@@ -282,7 +282,8 @@ def moments(form: Form, known: Natural, phi: Phi) -> Moments:
     count, mean = means.shape[0], jnp.mean(means, 0)
     covariance = total / count + jnp.cov(means, rowvar=False, bias=True).reshape(total.shape)
     sds = jnp.sqrt(jnp.maximum(variances, 0.0))
-    return Moments(mean, covariance, *interval(means, sds), jnp.mean(gammas, 0))
+    lower, upper = interval(means, sds)
+    return Moments(mean, covariance, lower, upper, jnp.mean(gammas, 0))
 
 
 @jax.jit
