@@ -271,9 +271,9 @@ def eigenvalues(matrices: Any) -> np.ndarray:
     return np.linalg.eigvalsh(matrices)
 
 
-def invert(matrices: Any) -> np.ndarray:
-    """Inverses of matrices (..., n, n) on the host."""
-    return np.linalg.inv(matrices)
+def invert(matrices: Any) -> Any:
+    """Inverses of matrices (..., n, n)."""
+    return library(matrices).linalg.inv(matrices)
 
 
 def pseudo_inverse(matrices: Any, symmetric: bool = False) -> np.ndarray:

@@ -1,6 +1,8 @@
 """The mode of the marginal density of the biases: its gradient, linear problems, and scenes of bearings."""
 
 from functools import partial
+from types import SimpleNamespace
+from typing import NamedTuple
 
 import bent
 import jax
@@ -12,11 +14,13 @@ from worlds import linear, resting
 import probcal
 from probcal import EA, MAP, Channel, ConstantVelocity, Gaussian, Network, Node, Problem, sensor, simulate
 from probcal.errors import InputError
+from probcal.gaussian.climb import find_marginal_mode
 from probcal.gaussian.linearised import laplace
-from probcal.gaussian.marginal import _damped, find_marginal_mode, volume_slope
-from probcal.gaussian.mode import DAMPING, cost, eliminate, find_mode
-from probcal.gaussian.search import HALVINGS, between, halved
+from probcal.gaussian.marginal import volume_slope
+from probcal.gaussian.mode import Point, cost, eliminate, find_mode
+from probcal.gaussian.search import between, climb_on_host, climb_traced, halved
 from probcal.geometry import bearing
+from probcal.linalg import library
 from probcal.modes import automatic_start
 from probcal.priors import Precision
 
@@ -78,10 +82,9 @@ def test_on_a_linear_problem_it_is_the_joint_mode():
 def test_steps_are_halved_apart_and_none_is_taken_where_none_would_do():
     """Of three steps along (t - a)^2 the first is whole, the second an eighth; the third only rises."""
     valley, bound = jnp.array([0.5, 0.1, -1.0]), jnp.array([0.25, 0.01, 1.0])
-    share, value, tries = halved(lambda t: (t - valley) ** 2, bound)
+    share, value = halved(lambda t: (t - valley) ** 2, bound)
     np.testing.assert_array_equal(share, [1.0, 0.125, 0.0])
     np.testing.assert_allclose(value, [0.25, 0.025**2, 1.0], rtol=1e-6)
-    assert tries == HALVINGS
     assert between(jnp.ones(()), jnp.nan, share[2]) == 1.0
 
 
@@ -157,13 +160,43 @@ def test_a_fit_of_the_marginal_says_what_it_is():
     assert "trajectory='marginal'" in trees["marginal"].attrs["settings"]
 
 
-def test_a_matrix_that_is_not_positive_is_damped_before_a_step_is_tried():
+class Wells:
+    """Two wells of (x^2 - 1)^2 / 4 + y^2 at x = 1 and -1, by their second derivatives: between them a ridge."""
+
+    def expand(self, point):
+        return SimpleNamespace(point=point, z=point.z) if isinstance(point.z, np.ndarray) else Looked(point, point.z)
+
+    def moved(self, at, dz):
+        return at.point._replace(z=at.z + dz)
+
+    def value(self, at):
+        return (at.z[0] ** 2 - 1) ** 2 / 4 + at.z[1] ** 2
+
+    def slope(self, at):
+        return -library(at.z).stack([at.z[0] * (at.z[0] ** 2 - 1), 2 * at.z[1]])
+
+    def solve(self, at, right, damping):
+        xp = library(at.z)
+        curved = xp.stack([3 * at.z[0] ** 2 - 1, xp.full((), 2.0)]) + damping
+        return xp.where(curved > 0, right / curved, xp.nan)
+
+
+class Looked(NamedTuple):
+    point: Point
+    z: jax.Array
+
+
+@pytest.mark.parametrize("far", [0.1, -0.4, 40.0])
+def test_a_search_from_the_host_is_the_traced_one_and_damped_where_no_precision_is_positive(far):
     with jax.enable_x64(True):
-        matrix, score = np.diag([2.0, -0.5]), np.ones(2)
-        solve = jax.jit(_damped)
-        step, damping, grown = solve(matrix, score, np.zeros(()))
-        assert (float(damping), int(grown)) == (pytest.approx(1.0), 4)
-        np.testing.assert_allclose(step, [1 / 3, 2.0])
-        step, damping, _ = solve(matrix, np.full(2, np.nan), np.zeros(()))
-        assert float(damping) > DAMPING
-        assert not np.isfinite(step).any(), "no damping helps: the search ends"
+        start = Point((), (), np.array([far, 3.0]), np.zeros(0))
+        host, trace = climb_on_host(Wells(), start, 2, 60, 1e-12)
+        traced = jax.device_get(jax.jit(lambda start: climb_traced(Wells(), start, 2, 60, 1e-12))(start))
+        nowhere, _ = climb_on_host(Wells(), start._replace(z=np.full(2, np.nan)), 2, 60, 1e-12)
+    assert host.converged
+    np.testing.assert_allclose(np.abs(host.at.z), [1.0, 0.0], atol=1e-5)
+    assert (host.taken, host.count) == (traced.taken, traced.count)
+    np.testing.assert_allclose(traced.at.z, host.at.z, atol=1e-9)
+    assert np.all(np.diff(trace) >= 0)
+    assert nowhere.done
+    assert not nowhere.converged

@@ -1,7 +1,7 @@
-"""To the mode of the marginal density of the biases, by what any engine gives; the host drives it.
+"""To the mode of the marginal density of the biases: from the host by any engine, traced by the dense one.
 
 The step is that of the posterior at the point under the factors of a prior, and what the secants of
-the last steps say of log det W (L-BFGS around it); each track is settled by steps of its own.
+the last steps say of log det W (`search`).
 """
 
 from __future__ import annotations
@@ -14,52 +14,91 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.gaussian.dense import DenseEngine
 from probcal.gaussian.engine import Engine, Expansion, Factors, evidence
-from probcal.gaussian.marginal import ENOUGH, LEAST_CURVED, SETTLED, TRACK_STEPS
-from probcal.gaussian.mode import Point, eliminate, follow
-from probcal.gaussian.search import HALVINGS, between, halved
+from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
+from probcal.gaussian.marginal import volume_slope
+from probcal.gaussian.mode import Eliminated, Mode, Point, cost, find_tracks, follow
+from probcal.gaussian.search import climb_on_host, climb_traced
+from probcal.gaussian.solves import Dense
 from probcal.gaussian.tails import Variances, renewed_noise
+from probcal.linalg import library
 from probcal.model.model import Model
 from probcal.priors import Precision
 
-KEPT = 8  # secants
-SMALL = 1e-9  # of the density: what a step that promises less cannot show
+
+class _Expanded(NamedTuple):
+    """The density of the biases times factors, by the expansions of any engine."""
+
+    expand: Callable[[Point], Expansion]
+    factors: Factors
+    marginal: bool
+
+    def moved(self, at: Expansion, dz: np.ndarray) -> Point:
+        return at.moved(dz)
+
+    def value(self, at: Expansion) -> np.ndarray:
+        volume = 0.0 if self.marginal else 0.5 * float(at.eliminated.logdet)
+        return np.asarray(-at.density() - volume - self.factors.value(at.point.z))
+
+    def slope(self, at: Expansion) -> np.ndarray:
+        return np.asarray(at.score() if self.marginal else at.slope()) + self.factors.pull(at.point.z)
+
+    def solve(self, at: Expansion, right: np.ndarray, damping: np.ndarray) -> np.ndarray:
+        more = Factors.alone(np.full(len(right), damping)) if damping else Factors()
+        try:
+            return np.asarray(at.solve(self.factors + more if damping else self.factors, right))
+        except np.linalg.LinAlgError:  # not positive definite
+            return np.full(len(right), np.nan)
 
 
-@jax.jit
-def settle_each(model: Model, point: Point) -> Point:
-    """Every track at its mode for the biases, each with a step length of its own: none waits for
-    another.
+class _Eliminated(NamedTuple):
+    point: Point
+    solved: Eliminated
 
-    A track that no part of a step improves stays where it is: on a cusp, where it grazes a sensor.
+
+class _Traced(NamedTuple):
+    """The marginal density of the biases, by eliminations that can be traced."""
+
+    model: Model
+    prior: Precision
+
+    def expand(self, point: Point) -> _Eliminated:
+        point = find_tracks(self.model, point)
+        return _Eliminated(point, compress_and_eliminate(self.model, point, linearise_rows(self.model, point))[1])
+
+    def moved(self, at: _Eliminated, dz: jax.Array) -> Point:
+        return follow(self.model, at.point, at.solved, dz)
+
+    def value(self, at: _Eliminated) -> jax.Array:
+        return cost(self.model, at.point, self.prior) + 0.5 * at.solved.logdet
+
+    def slope(self, at: _Eliminated) -> jax.Array:
+        volume, _ = volume_slope(self.model, at.point, at.solved)
+        return at.solved.score - self.prior.pull(at.point.z) - 0.5 * volume
+
+    def solve(self, at: _Eliminated, right: jax.Array, damping: jax.Array) -> jax.Array:
+        return Dense.of(at.solved.information + self.prior.matrix() + damping * jnp.eye(len(right))).solve(right)
+
+
+def find_marginal_mode(
+    model: Model, start: Point, prior: Precision, iterations: int, tolerance: Any
+) -> tuple[Mode, Eliminated]:
+    """The mode of the marginal density to which a climb by the dense engine comes, and the system eliminated there.
+
+    It ends where a step promises less than `tolerance`; levels are held. The cost of the mode is
+    that of the marginal density. Called from Python it goes from step to step by kernels that other
+    parts of a fit use too; inside a compiled function it is a loop.
     """
-
-    def costs(at: Point) -> list[jax.Array]:
-        """Negative log density (T,) of the tracks of each recursion."""
-        sums = model.by_epoch(model.log_likelihood(at))
-        return list(model.by_target(model.each(lambda _, own, u: 0.5 * jnp.sum(u**2, 1) - own, sums, at.noises)))
-
-    def part_way(at: Point, full: Point, shares: list[jax.Array]) -> Point:
-        def go(part: Any, old: jax.Array, new: jax.Array, share: jax.Array) -> jax.Array:
-            return between(old, new, share[part.target][:, None])
-
-        states, noises = (
-            model.each(go, old, new, shares)
-            for old, new in ((at.states, full.states), (at.noises, full.noises))
-        )  # fmt: skip
-        return at._replace(states=states, noises=noises)
-
-    def body(carry: Any) -> Any:
-        at, before, _, count = carry
-        solved = eliminate(model, at, expected=False, joint=False)
-        full = follow(model, at, solved, jnp.zeros_like(at.z))
-
-        shares, after, _ = halved(lambda shares: costs(part_way(at, full, shares)), before)
-        gain = jnp.max(jnp.stack([jnp.max(old - new) for new, old in zip(after, before, strict=True)]))
-        return part_way(at, full, shares), after, gain, count + 1
-
-    first = (point, costs(point), jnp.full((), jnp.inf), 0)
-    return jax.lax.while_loop(lambda c: (c[2] > SETTLED) & (c[3] < TRACK_STEPS), body, first)[0]
+    if library(*jax.tree.leaves((model, start, prior, tolerance))) is np:
+        expanded = _Expanded(partial(DenseEngine().settled, model), Factors.of(prior), True)
+        s, _ = climb_on_host(expanded, start, model.biases, iterations, tolerance)
+        solved = s.at.eliminated
+    else:
+        s = climb_traced(_Traced(model, prior), start, model.biases, iterations, tolerance)
+        solved = s.at.solved
+    refused = (s.taken <= 1) & ~s.converged
+    return Mode(s.at.point, s.value, s.count - 1, s.converged, refused, s.begun - s.value, 0.5 * solved.logdet), solved
 
 
 class Climbed(NamedTuple):
@@ -80,50 +119,13 @@ def climb_to_mode(
     """Climb to the mode of the marginal density times factors until a step promises less than
     tolerance.
 
-    Without `marginal` it is the joint mode of biases and trajectories. `expand` gives the posterior
-    at a point whose tracks it settles first. A step that does not bring its share of what it
-    promises is halved. It ends where `told`, called with the number of steps and the density, says
-    so. Raises `numpy.linalg.LinAlgError` where the precision is not
-    positive definite: a flat prior on what no data tell.
+    Without `marginal` it is the joint mode of biases and trajectory. `expand` gives the posterior
+    at a point whose tracks it settles first. It ends where `told`, called with the number of steps
+    and the density, says so.
     """
-
-    def looked(point: Point) -> tuple[Expansion, float]:
-        at = expand(point)
-        volume = 0.0 if marginal else 0.5 * float(at.eliminated.logdet)
-        return at, -at.density() - volume - factors.value(np.asarray(at.point.z))
-
-    def slope_at(at: Expansion) -> np.ndarray:
-        own = at.score() if marginal else at.slope()
-        return np.asarray(own) + factors.pull(np.asarray(at.point.z))
-
-    here, value = looked(start)
-    secants: list[tuple[np.ndarray, np.ndarray]] = []
-    trace, converged, ended = [-value], False, False
-    slope = slope_at(here)
-    while True:
-        step = _direction(here, factors, slope, secants)
-        promised = 0.5 * float(slope @ step)
-        converged = promised <= max(tolerance, SMALL * 1e-3 * abs(value)) and np.isfinite(value)
-        if converged or ended or len(trace) > iterations or not np.isfinite(value):
-            break
-        share, better = 1.0, False
-        for _ in range(HALVINGS):
-            there, after = looked(here.moved(share * step))
-            better = bool(value - after >= ENOUGH * share * promised and after <= value)
-            if better:
-                break
-            share *= 0.5
-        if not better:
-            converged = promised <= SMALL * abs(value)
-            break
-        moved, before = np.asarray(there.point.z) - np.asarray(here.point.z), slope
-        slope = slope_at(there)
-        if moved @ (before - slope) > LEAST_CURVED * share * (moved @ before):
-            secants = [*secants, (moved, before - slope)][-KEPT:]
-        here, value = there, after
-        trace.append(-value)
-        ended = told is not None and told(len(trace) - 1, -value)
-    return Climbed(here, value, np.array(trace), converged, not converged and len(trace) == 1)
+    expanded = _Expanded(expand, factors, marginal)
+    s, trace = climb_on_host(expanded, start, len(start.z), iterations, tolerance, told)
+    return Climbed(s.at, float(s.value), trace, bool(s.converged), len(trace) == 1 and not s.converged)
 
 
 def climb_with_noise(
@@ -161,19 +163,3 @@ def climb_with_noise(
                 refused=mode.refused and len(trace) == 2,
             )
         model, point = renewed_noise(model, mode.at.point, Variances.of(mode.at, factors))
-
-
-def _direction(
-    at: Expansion, factors: Factors, slope: np.ndarray, secants: list[tuple[np.ndarray, np.ndarray]]
-) -> np.ndarray:
-    """The step of L-BFGS around an inverse curvature (Nocedal, Wright 2006, algorithm 7.4)."""
-    q, parts = slope.copy(), []
-    for moved, change in reversed(secants):
-        scale = 1.0 / (moved @ change)
-        share = scale * (moved @ q)
-        q = q - share * change
-        parts.append((moved, change, scale, share))
-    step = np.asarray(at.solve(factors, q))
-    for moved, change, scale, share in reversed(parts):
-        step = step + moved * (share - scale * (change @ step))
-    return step

@@ -94,5 +94,5 @@ def shorten(model: Model, point: Point, proposal: Point, prior: Precision, slack
 
     Also whether there was none.
     """
-    found, _, better, _ = shortened(model, point, proposal, prior, cost(model, point, prior) + slack)
-    return found, ~better
+    found, _, share = shortened(model, point, proposal, prior, cost(model, point, prior) + slack)
+    return found, share == 0

@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.room import check_room
-from probcal.gaussian.search import between, halved
+from probcal.gaussian.search import DAMPING, ROUNDING, between, damped_on, halved
 from probcal.gaussian.solves import Dense
 from probcal.model.model import At, Model, Recursion, Where
 from probcal.model.rows import Linearised
@@ -22,8 +23,8 @@ from probcal.model.trajectories import Trajectories
 from probcal.priors import Precision
 
 CHORD = 0.1  # share of the last gain up to which what was eliminated serves on
-DAMPING = 1e10  # damping at which the iteration gives up
-ROUNDING = 1e-12  # of the cost: what a step that promises less cannot show
+TRACK_STEPS = 30  # of tracks at held biases
+SETTLED = 1e-10  # nats at which they end: log det W moves with the trajectories to first order
 apart = jax.lax.optimization_barrier  # keeps XLA from weaving two computations together, or doing one of them twice
 
 
@@ -290,14 +291,14 @@ def follow(model: Model, point: Point, solved: Eliminated, dz: jax.Array, *, fre
 
 def shortened(
     model: Model, point: Point, proposal: Point, prior: Precision, bound: jax.Array
-) -> tuple[Point, jax.Array, jax.Array, jax.Array]:
+) -> tuple[Point, jax.Array, jax.Array]:
     """The part of a step whose cost does not exceed a bound, halved until then.
 
-    Returns the point, its cost, whether there was such a part, and how many were tried. Consistent
-    trajectories stay consistent.
+    Returns the point, its cost and the part, 0 where there is none. Consistent trajectories stay
+    consistent.
     """
-    share, value, tries = halved(lambda share: cost(model, between(point, proposal, share), prior), bound)
-    return between(point, proposal, share), value, share > 0, tries
+    share, value = halved(lambda share: cost(model, between(point, proposal, share), prior), bound)
+    return between(point, proposal, share), value, share
 
 
 class _Search(NamedTuple):
@@ -343,9 +344,8 @@ def find_mode(
         solved = at(s.point) if known is None else jax.lax.cond(s.iteration == 0, lambda _: known, at, s.point)
         proposal, promised = _proposal(model, s.point, prior, s.damping, joint, solved)
 
-        point, value, better, tries = shortened(model, s.point, proposal, prior, s.cost)
-        damping = jnp.where(better & (tries <= 2), s.damping * 0.1, jnp.maximum(s.damping * 10.0, 1e-3))
-        damping = jnp.where(damping < 1e-6, 0.0, damping)
+        point, value, share = shortened(model, s.point, proposal, prior, s.cost)
+        better, damping = share > 0, damped_on(s.damping, share)
         change = jnp.where(better, s.cost - value, jnp.inf)
         rounding = ROUNDING * jnp.abs(s.cost)
         small = jnp.abs(promised) <= jnp.maximum(tolerance, rounding)
@@ -372,43 +372,63 @@ def find_mode(
 
 class _Tracking(NamedTuple):
     point: Point
-    cost: jax.Array
+    costs: jax.Array  # (T,) of each target
     solved: Eliminated  # of some point on the way
     renew: jax.Array  # eliminate anew at the next step
     change: jax.Array
+    moving: jax.Array  # (T,) tracks that are not yet at their mode
     iteration: jax.Array
-    done: jax.Array
 
 
 @jax.jit
-def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -> Point:
-    """Trajectories at held biases until the cost changes by less than `tolerance`: iterated EKS by chords.
+def find_tracks(model: Model, start: Point, iterations: int = TRACK_STEPS, tolerance: float = SETTLED) -> Point:
+    """Trajectories at held biases until the cost of each changes by less than `tolerance`: iterated EKS by chords.
 
     What was eliminated serves the next steps too while each gains a tenth of the one before or less (Kelley 1995, 5.4):
-    they need the score alone. A step that does not lower the cost is halved; where no part of it does, it ends.
+    they need the score alone. Each track halves a step by itself, so that none waits for another; one that no part of a
+    step improves stays where it is: on a cusp, where it grazes a sensor.
     """
-    flat = Precision(jnp.zeros_like(start.z))
     still = jnp.zeros_like(start.z)
     score = jax.grad(lambda states, at: log_likelihood(model, At(states, at.z, at.levels)))
 
     def at(point: Point) -> Eliminated:
         return eliminate(model, point, expected=False, joint=False)
 
+    def costs(at: Point) -> jax.Array:
+        sums = model.by_epoch(model.log_likelihood(at))
+        own = model.each(lambda _, own, u: 0.5 * jnp.sum(u**2, 1) - own, sums, at.noises)
+        return jnp.concatenate(model.by_target(own))
+
+    def part_way(point: Point, full: Point, shares: jax.Array) -> Point:
+        own = jnp.split(shares, np.cumsum(model.targets)[:-1])
+        by_epoch = model.each(lambda part, share: share[part.target][:, None], own)
+        tracks = Trajectories(by_epoch, by_epoch)
+        return point._replace(trajectories=jax.tree.map(between, point.trajectories, full.trajectories, tracks))
+
     def body(s: _Tracking) -> _Tracking:
         solved = jax.lax.cond(s.renew, at, lambda _: s.solved, s.point)
         pulls = score(s.point.states, s.point)
         parts = model.each(lambda _, kept, pull: kept._replace(pull=pull), solved.parts, pulls)
-        proposal = follow(model, s.point, solved._replace(parts=parts), still, free=True)
-        point, value, better, _ = shortened(model, s.point, proposal, flat, s.cost)
-        change = jnp.where(better, s.cost - value, s.change)
-        renew = ~better | (change > CHORD * s.change)
-        done = (better & (change < tolerance)) | (~better & s.renew)
-        return _Tracking(point, value, solved, renew, change, s.iteration + 1, done)
+        full = follow(model, s.point, solved._replace(parts=parts), still, free=True)
+
+        def taken(shares: jax.Array) -> Point:
+            return part_way(s.point, full, jnp.where(s.moving, shares, 0.0))
+
+        bound = jnp.where(s.moving, s.costs, jnp.inf)
+        shares, after = halved(lambda shares: costs(taken(shares)), bound)
+        stuck, gain = shares == 0, jnp.where(s.moving, s.costs - after, 0.0)
+        moving = s.moving & jnp.where(stuck, ~s.renew, gain >= tolerance)
+        waits, most = jnp.any(stuck), jnp.max(gain)
+        return _Tracking(
+            taken(shares), jnp.where(s.moving, after, s.costs), solved, waits | (most > CHORD * s.change),
+            jnp.where(waits, s.change, most), moving, s.iteration + 1,
+        )  # fmt: skip
 
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(at, start))
-    yes, no = jnp.ones((), bool), jnp.zeros((), bool)
-    first = _Tracking(start, cost(model, start, flat), blank, yes, jnp.full((), jnp.inf), jnp.zeros((), int), no)
-    return jax.lax.while_loop(lambda s: ~s.done & (s.iteration < iterations), body, first).point
+    begun, infinite = costs(start), jnp.full((), jnp.inf)
+    every = jnp.ones(begun.shape, bool)
+    first = _Tracking(start, begun, blank, jnp.ones((), bool), infinite, every, jnp.zeros((), int))
+    return jax.lax.while_loop(lambda s: jnp.any(s.moving) & (s.iteration < iterations), body, first).point
 
 
 def smooth_tracks(model: Model, point: Point, iterations: int = 20) -> Point:

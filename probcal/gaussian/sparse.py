@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian import recursion as rec
-from probcal.gaussian.climb import settle_each
 from probcal.gaussian.engine import Estimate, Factors, Sampled, Spread, density_of
 from probcal.gaussian.factor import Factor, Library
 from probcal.gaussian.held import hold, inform
@@ -20,7 +19,7 @@ from probcal.gaussian.joint import JointPrecision
 from probcal.gaussian.jointly import times_weights
 from probcal.gaussian.linearised import GivenBiases, given_biases, linearise_rows
 from probcal.gaussian.marginal import volume_slope
-from probcal.gaussian.mode import Eliminated, Point, factors, inverse_factors
+from probcal.gaussian.mode import Eliminated, Point, factors, find_tracks, inverse_factors
 from probcal.model.model import Data, Model, scaled
 from probcal.model.rows import Linearised
 
@@ -55,7 +54,7 @@ class SparseEngine:
 
     def settled(self, model: Model, point: Point) -> SparseExpansion:
         """The same at the modes of its trajectories for its biases."""
-        return self.at(model, settle_each(model, point))
+        return self.at(model, find_tracks(model, point))
 
 
 @dataclass(frozen=True, eq=False)

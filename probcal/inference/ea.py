@@ -12,9 +12,9 @@ import numpy as np
 
 from probcal.errors import InputError
 from probcal.gaussian.choose import engine_named, estimates
+from probcal.gaussian.climb import find_marginal_mode
 from probcal.gaussian.engine import Engine
 from probcal.gaussian.linearised import laplace_of
-from probcal.gaussian.marginal import find_marginal_mode
 from probcal.gaussian.mode import Eliminated, Mode, Point, cost, eliminate, find_mode, mixing_gain
 from probcal.inference.ending import astray
 from probcal.inference.hierarchy import held, hierarchy_of

@@ -143,7 +143,7 @@ def _shortened(model: Model, found: Ensemble, states: Any, state: Climb, now: Pr
             told = sum((jnp.sum(part) for part in model.log_likelihood(At(states, z, state.levels))), jnp.zeros(()))
         return told - 0.5 * now.square(z)
 
-    share, *_ = halved(lambda share: -value(state.z + share * step), -value(state.z))
+    share, _ = halved(lambda share: -value(state.z + share * step), -value(state.z))
     return share * step
 
 

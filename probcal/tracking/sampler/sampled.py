@@ -145,7 +145,7 @@ def fitted(scene: Recording, views: tuple[View, ...], a: Association) -> Fit:
         moved = jax.vmap(lambda x, u, own: follow(model, at(x, u, z), own, dz))(x, u, solved)
         full = (moved.states[0], moved.noises[0], z + dz)
 
-        share, new, _ = halved(lambda share: cost(*between((x, u, z), full, share)), value)
+        share, new = halved(lambda share: cost(*between((x, u, z), full, share)), value)
         return between((x, u, z), full, share), solved, new, value - new, count + 1
 
     start = _begun(scene, L, used, a)
