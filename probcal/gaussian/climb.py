@@ -18,7 +18,7 @@ from probcal.gaussian.dense import DenseEngine
 from probcal.gaussian.engine import Engine, Expansion, Factors, evidence
 from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
 from probcal.gaussian.marginal import volume_slope
-from probcal.gaussian.mode import Eliminated, Mode, Point, cost, find_tracks, follow
+from probcal.gaussian.mode import SETTLED, TRACK_STEPS, Eliminated, Mode, Point, cost, find_tracks, follow
 from probcal.gaussian.search import climb_on_host, climb_traced
 from probcal.gaussian.solves import Dense
 from probcal.gaussian.tails import Variances, renewed_noise
@@ -64,7 +64,7 @@ class _Traced(NamedTuple):
     prior: Precision
 
     def expand(self, point: Point) -> _Eliminated:
-        point = find_tracks(self.model, point)
+        point = find_tracks(self.model, point, TRACK_STEPS, SETTLED)
         return _Eliminated(point, compress_and_eliminate(self.model, point, linearise_rows(self.model, point))[1])
 
     def moved(self, at: _Eliminated, dz: jax.Array) -> Point:

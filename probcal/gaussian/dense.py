@@ -23,7 +23,7 @@ from probcal.gaussian.linearised import (
     trajectories_of,
 )
 from probcal.gaussian.marginal import volume_slope
-from probcal.gaussian.mode import Compressed, Eliminated, Point, find_tracks, follow
+from probcal.gaussian.mode import SETTLED, TRACK_STEPS, Compressed, Eliminated, Point, find_tracks, follow
 from probcal.gaussian.solves import Dense
 from probcal.linalg import without_negative
 from probcal.model.model import Data, Model, scaled
@@ -44,7 +44,7 @@ class DenseEngine:
 
     def settled(self, model: Model, point: Point) -> DenseExpansion:
         """The same at the modes of its trajectories for its biases."""
-        return self.at(model, find_tracks(model, point))
+        return self.at(model, find_tracks(model, point, TRACK_STEPS, SETTLED))
 
 
 @dataclass(frozen=True, eq=False)

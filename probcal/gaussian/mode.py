@@ -381,7 +381,7 @@ class _Tracking(NamedTuple):
 
 
 @jax.jit
-def find_tracks(model: Model, start: Point, iterations: int = TRACK_STEPS, tolerance: float = SETTLED) -> Point:
+def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -> Point:
     """Trajectories at held biases until the cost of each changes by less than `tolerance`: iterated EKS by chords.
 
     What was eliminated serves the next steps too while each gains a tenth of the one before or less (Kelley 1995, 5.4):

@@ -19,7 +19,7 @@ from probcal.gaussian.joint import JointPrecision
 from probcal.gaussian.jointly import times_weights
 from probcal.gaussian.linearised import GivenBiases, given_biases, linearise_rows
 from probcal.gaussian.marginal import volume_slope
-from probcal.gaussian.mode import Eliminated, Point, factors, find_tracks, inverse_factors
+from probcal.gaussian.mode import SETTLED, TRACK_STEPS, Eliminated, Point, factors, find_tracks, inverse_factors
 from probcal.model.model import Data, Model, scaled
 from probcal.model.rows import Linearised
 
@@ -54,7 +54,7 @@ class SparseEngine:
 
     def settled(self, model: Model, point: Point) -> SparseExpansion:
         """The same at the modes of its trajectories for its biases."""
-        return self.at(model, find_tracks(model, point))
+        return self.at(model, find_tracks(model, point, TRACK_STEPS, SETTLED))
 
 
 @dataclass(frozen=True, eq=False)
