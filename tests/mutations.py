@@ -89,8 +89,10 @@ MUTATIONS = [
     # gaussian/marginal.py
     Mutation("slope = own + jax.grad(along)(point.z)", "slope = own", "test_marginal.py"),
     Mutation("tuple(-own - jnp.einsum(", "tuple(0 * own - 0 * jnp.einsum(", "test_marginal.py"),
-    Mutation("score = solved.score - prior.pull(point.z) - 0.5 * volume", "score = solved.score - prior.pull(point.z) + 0.5 * volume", "test_marginal.py"),
-    Mutation("update = jnp.outer(change, change)", "update = 2 * jnp.outer(change, change)", "test_marginal.py"),
+    # gaussian/climb.py
+    Mutation("self.prior.pull(at.point.z) - 0.5 * volume", "self.prior.pull(at.point.z) + 0.5 * volume", "test_marginal.py"),
+    # gaussian/search.py
+    Mutation("(own * share - changes @ step)", "(own * share + changes @ step)", "test_marginal.py"),
     # process noise that is not Gaussian
     Mutation("jnp.sum((u**2 + variance)[:", "jnp.sum((u**2)[:", "test_tails.py"),
     Mutation("jnp.sqrt(new.weight / old.weight)", "jnp.sqrt(old.weight / new.weight)", "test_tails.py"),

@@ -161,7 +161,7 @@ def test_a_fit_of_the_marginal_says_what_it_is():
 
 
 class Wells:
-    """Two wells of (x^2 - 1)^2 / 4 + y^2 at x = 1 and -1, by their second derivatives: between them a ridge."""
+    """Two wells of (x^2 - 1)^2 / 4 + y^2 at x = 1 and -1, a ridge between them; steps know half the curvature by y."""
 
     def expand(self, point):
         return SimpleNamespace(point=point, z=point.z) if isinstance(point.z, np.ndarray) else Looked(point, point.z)
@@ -177,7 +177,7 @@ class Wells:
 
     def solve(self, at, right, damping):
         xp = library(at.z)
-        curved = xp.stack([3 * at.z[0] ** 2 - 1, xp.full((), 2.0)]) + damping
+        curved = xp.stack([3 * at.z[0] ** 2 - 1, xp.full((), 1.0)]) + damping
         return xp.where(curved > 0, right / curved, xp.nan)
 
 

@@ -1,4 +1,4 @@
-"""To the mode of the marginal density of the biases: from the host by any engine, traced by the dense one.
+"""Climbs to the mode of the marginal density: from the host by any engine, traced by the dense one.
 
 The step is that of the posterior at the point under the factors of a prior, and what the secants of
 the last steps say of log det W (`search`).
@@ -84,7 +84,7 @@ class _Traced(NamedTuple):
 def find_marginal_mode(
     model: Model, start: Point, prior: Precision, iterations: int, tolerance: Any
 ) -> tuple[Mode, Eliminated]:
-    """The mode of the marginal density to which a climb by the dense engine comes, and the system eliminated there.
+    """The mode of the marginal density by a climb of the dense engine, and the system eliminated there.
 
     It ends where a step promises less than `tolerance`; levels are held. The cost of the mode is
     that of the marginal density. Called from Python it goes from step to step by kernels that other

@@ -1,7 +1,7 @@
 """The search of a mode: one rule for the length of a step, one for its damping, one for the end.
 
-`stepped` is a quasi-Newton step of the biases on an objective; `climb_on_host` and `climb_traced`
-repeat it. `halved` shortens a step inside a compiled search whose values cost little.
+`search_step` is a quasi-Newton step of the biases on an objective; `climb_on_host` and
+`climb_traced` repeat it. `halved` shortens a step inside a compiled search whose values cost little.
 """
 
 from collections.abc import Callable
@@ -16,14 +16,16 @@ from probcal.linalg import invert, library
 
 HALVINGS = 12  # lengths of a step that are tried, each half of the one before
 KEPT = 8  # secants
-ENOUGH = 0.1  # share of the promised rise that a step must bring: along what motion noise alone fixes, half a step does
+# share of the promised rise that a step must bring: half a step does along what motion noise fixes
+ENOUGH = 0.1
 LEAST_CURVED = 0.05  # share of its curvature so far that a secant must show
 LEAST_DAMPED = 0.25  # part of a damped step that is tried at least: more damping shortens it too
 SHORT = 0.5  # part of a step from which the damping falls again
 DAMPING = 1e10  # damping at which a search gives up
 ROUNDING = 1e-12  # of the density: what a step that promises less cannot show
 SMALL = 1e-9  # of the density: what no part of a step that promises less can show
-NOTHING = 1e-4  # nats (0.014 sd) that a slope may promise in vain: tracks that settle slowly leave it that uncertain
+# nats (0.014 sd) that a slope may promise in vain: tracks that settle slowly leave that uncertain
+NOTHING = 1e-4
 
 
 class Objective(Protocol):
@@ -71,8 +73,9 @@ class Search(NamedTuple):
         return cls(at, zero, zero, none, pairs, pairs, none, zero, np.ones(()), zero, count, count, no, no)
 
 
-def stepped(objective: Objective, s: Search, at: Any, tolerance: Any) -> Search:
-    """The search after a look at an expansion: the next direction from there, or a shorter or more damped step."""
+def search_step(objective: Objective, s: Search, at: Any, tolerance: Any) -> Search:
+    """The search after a look at an expansion: a direction from there, or a shorter or more damped
+    step."""
     value = objective.value(at)
     better = (s.value - value >= ENOUGH * s.share * s.promised) & (value <= s.value)
     s = _either(better | (s.taken == 0), partial(_taken, objective), _refused, s, at, value)
@@ -83,14 +86,15 @@ def climb_on_host(
     objective: Objective, start: Any, biases: int, iterations: int, tolerance: float,
     told: Callable[[int, float], bool] | None = None,
 ) -> tuple[Search, np.ndarray]:  # fmt: skip
-    """Search from a start until a step promises less than the tolerance; also the log density after every step.
+    """Search from a start until a step promises less than the tolerance.
 
-    It ends too where `told`, called with the number of steps and the log density, says so.
+    Returns the search and the log density after every step. It ends too where `told`, called with
+    the number of steps and the log density, says so.
     """
     at, trace = objective.expand(start), list[float]()
     s = Search.begin(at, biases)
     while True:
-        s = stepped(objective, s, at, tolerance)
+        s = search_step(objective, s, at, tolerance)
         if s.taken > len(trace):
             trace.append(-float(s.value))
             if told is not None and len(trace) > 1 and told(len(trace) - 1, trace[-1]):
@@ -109,7 +113,7 @@ def climb_traced(objective: Objective, start: Any, biases: int, iterations: int,
     def body(s: Search) -> Search:
         moved = objective.moved(s.at, s.share * s.step)
         point = jax.tree.map(lambda new, old: jnp.where(s.taken == 0, old, new), moved, start)
-        return stepped(objective, s, objective.expand(point), tolerance)
+        return search_step(objective, s, objective.expand(point), tolerance)
 
     return jax.lax.while_loop(lambda s: ~s.done & (s.count <= iterations), body, Search.begin(blank, biases))
 
@@ -149,7 +153,8 @@ def _taken(objective: Objective, s: Search, at: Any, value: Any) -> Search:
 
 
 def _refused(s: Search, *_: Any) -> Search:
-    """The search with half the step, or where that was tried often enough, soon where it is damped, more damping.
+    """The search with half the step, or more damping where that was tried often enough, soon where it
+    is damped.
 
     A step that promised less than the rounding of the density, and shows nothing, is the end; one that promised
     `NOTHING` is where no part of it shows anything.
@@ -169,7 +174,7 @@ def _directed(objective: Objective, tolerance: Any, s: Search) -> Search:
 
     def more(state: Any) -> Any:
         damping = xp.where(state[2], s.damping, grown(state[1]))
-        step = direction(objective, s, damping)
+        step = _direction(objective, s, damping)
         return step, damping, xp.zeros((), bool)
 
     def lacking(state: Any) -> Any:
@@ -191,10 +196,11 @@ def _directed(objective: Objective, tolerance: Any, s: Search) -> Search:
     )  # fmt: skip
 
 
-def direction(objective: Objective, s: Search, damping: Any) -> Any:
-    """The step (M,) of L-BFGS around a solve (Nocedal, Wright 2006, algorithm 7.4), its two loops as solves.
+def _direction(objective: Objective, s: Search, damping: Any) -> Any:
+    """The step (M,) of L-BFGS around a solve (Nocedal, Wright 2006, algorithm 7.4).
 
-    Damping is a curvature of its own, so secants have it too.
+    Its two loops are solves with a triangular matrix of the secants. Damping is a curvature of its
+    own, so secants have it too.
     """
     xp, changes = library(s.share), s.changes + damping * s.moves
     both = xp.triu(s.moves @ changes.T)
@@ -206,9 +212,10 @@ def direction(objective: Objective, s: Search, damping: Any) -> Any:
 
 
 def halved(value: Callable[[jax.Array], jax.Array], bound: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Halve a step until its value does not exceed the bound, an array whose entries have step lengths of their own.
+    """Halve a step until its value does not exceed the bound.
 
-    Returns the fractions of the step, 0 where none would do, and their values, there the bound.
+    The bound is an array; each entry has a step length of its own. Returns the fractions of the
+    step, 0 where none would do, and their values, there the bound.
     """
 
     def shorter(state: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
