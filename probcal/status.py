@@ -32,9 +32,14 @@ class Status(StrEnum):
         return self in (Status.CONVERGED, Status.SPENT)
 
     @property
-    def unsettled(self) -> "Status":
-        """The status of a fit of which something is left to do."""
-        return Status.NOT_CONVERGED if self.settled else self
+    def explains(self) -> bool:
+        """Whether the model explains the data at all."""
+        return self is not Status.MISFIT
+
+    @property
+    def again(self) -> bool:
+        """Whether a run with other random numbers may end otherwise."""
+        return self in (Status.NOT_CONVERGED, Status.MISFIT)
 
 
 WORDS = {
@@ -48,6 +53,7 @@ WORDS = {
 }
 INVALID = tuple(str(status) for status in Status if not status.valid)  # of a fit or of a bias
 GRAVITY = (
+    Status.GAUGE,
     Status.MISFIT,
     Status.DIVERGED,
     Status.AT_BOUND,
@@ -66,7 +72,7 @@ class Rule(NamedTuple):
 
 
 DIVERGED = "The fit diverged: {}; the estimate is invalid. "
-CLIMB = (  # the first of them that holds
+CLIMB = (  # the first of them that holds, of tracks by particles too
     Rule("misfit", Status.MISFIT, "{misfit}"),
     Rule(
         "far",
@@ -97,6 +103,36 @@ CLIMB = (  # the first of them that holds
         "The precision of {low} stands at its lower bound: the estimate is invalid.",
     ),
     Rule(
+        "left",
+        Status.NOT_CONVERGED,
+        "What is left of the rows has a mean square of {left:.1f} where 1 is expected: another optimum may"
+        " explain them, or the noise std is too small. Take {better} or further starts.",
+    ),
+    Rule(
+        "lost",
+        Status.NOT_CONVERGED,
+        "What is left of the rows has a mean square of {lost:.1f} where 1 is expected: particles lost a target,"
+        " or its motion, the calibration or the noise std is not right. Take more particles.",
+    ),
+    Rule(
+        "alike",
+        Status.NOT_CONVERGED,
+        "At some epoch only {alike} of the smoothed particles differ, so that their spread says little: take more"
+        ' of them, or Particles(proposal="extended") where the motion has a linear form.',
+    ),
+    Rule(
+        "ahead",
+        Status.NOT_CONVERGED,
+        "The slope of the likelihood where the fit ended asks for a step of {ahead:.1f} sd per bias: it is not the"
+        " top. Take {better} or more iterations.",
+    ),
+    Rule(
+        "inexact",
+        Status.NOT_CONVERGED,
+        "The sd of {inexact[0]} has a Monte Carlo error of {inexact[1]:.0%} after {inexact[2]} filters: take more"
+        " particles.",
+    ),
+    Rule(
         "fallen",
         Status.NOT_CONVERGED,
         "The evidence fell by {fallen:.3g} nats below its best on the way: the fit ran to a place"
@@ -107,9 +143,14 @@ CLIMB = (  # the first of them that holds
     Rule(
         "moved",
         Status.SPENT,
-        "All {iterations} iterations were run, as asked; the last moved the objective by {moved}.",
+        "All {iterations} iterations were run, as asked; {moved}.",
     ),
     Rule("spent", Status.SPENT, ""),
+    Rule(
+        "moving",
+        Status.NOT_CONVERGED,
+        "The fit did not converge in {iterations} iterations: {moving}; allow more.",
+    ),
     Rule(
         "iterations",
         Status.NOT_CONVERGED,
@@ -118,8 +159,14 @@ CLIMB = (  # the first of them that holds
 )
 CHAINS = (  # the gravest of those that hold; all are said
     Rule("misfit", Status.MISFIT, "{misfit}"),
+    Rule("objects", Status.CONVERGED, "{objects[0]:.2f} objects in {objects[1]} scans."),
     Rule("note", Status.CONVERGED, "{note}"),
     Rule("stopped", Status.NOT_CONVERGED, "{stopped}; --resume goes on."),
+    Rule(
+        "single",
+        Status.CONVERGED,
+        "One chain alone does not show whether it has mixed; take 2 or more.",
+    ),
     Rule(
         "r_hat",
         Status.NOT_CONVERGED,
@@ -158,12 +205,12 @@ CHAINS = (  # the gravest of those that hold; all are said
     Rule(
         "accepted",
         Status.CONVERGED,
-        "The delayed-acceptance rate is {accepted:.1%}: biases move only through HMC steps.",
+        "The delayed-acceptance rate is {accepted[0]:.1%}: biases move only through HMC steps.",
     ),
     Rule(
         "hmc",
         Status.NOT_CONVERGED,
-        "The HMC acceptance rate of a chain is {hmc:.1%}: its tracks hardly move; take NUTS().",
+        "The HMC acceptance rate of a chain is {hmc[0]:.1%}: its tracks hardly move; take NUTS().",
     ),
     Rule("turns", Status.NOT_CONVERGED, "A chain takes {turns[0]:.1%} of its {turns[1]}."),
     Rule(
@@ -182,11 +229,104 @@ CHAINS = (  # the gravest of those that hold; all are said
         Status.DIVERGED,
         "Some biases lie far from the stated values: use a prior, or fix some.",
     ),
+    Rule(
+        "renewed",
+        Status.NOT_CONVERGED,
+        "A sweep renews {renewed[0]:.0%} of the paths only: take more particles.",
+    ),
+    Rule(
+        "full",
+        Status.CONVERGED,
+        "All {full[0]} objects are there in {full[1]:.0%} of the draws: give most= room for more.",
+    ),
+)
+STREAM = (
+    Rule("unexplained", Status.MISFIT, ""),  # the watch over the sensors names them
+    Rule("narrow", Status.NOT_CONVERGED, "Intervals may be too narrow."),
+    Rule("windows", Status.NOT_CONVERGED, "{windows} did not come to rest: fit the rows as a batch."),
+    Rule(
+        "astray",
+        Status.NOT_CONVERGED,
+        "{astray} began where the first rows do not give a place: declare the start,"
+        " Target(motion, start={{...}}), or take a lag.",
+    ),
+    Rule(
+        "ancestors",
+        Status.NOT_CONVERGED,
+        "{ancestors} of the first particles are left: take more, or AugmentedFilter() where it serves.",
+    ),
+)
+OBJECTS = (  # of detections that name no target
+    Rule(
+        "moving",
+        Status.NOT_CONVERGED,
+        "{method} did not come to rest in {rounds} rounds: objects and biases still change.",
+    ),
+    Rule(
+        "apart",
+        Status.NOT_CONVERGED,
+        "The objects of {apart} do not tell how they stand to the other sensors: their"
+        " biases are not found; give more common objects that turn, or state the pose.",
+    ),
+    Rule(
+        "rivals",
+        Status.NOT_CONVERGED,
+        "Several poses explain the detections as well (how many): {rivals}. Survey one of these, or give objects"
+        " that turn.",
+    ),
+    Rule(
+        "disagree",
+        Status.MISFIT,
+        "{disagree[0]} should see {disagree[1]} and never does, {disagree[2]} should see {disagree[3]} and never"
+        " does: the two differ by what no bias allows for. Check their clocks and Detection(...), or give the sensor"
+        " a bias for it.",
+    ),
+)
+FOUND = (  # of an answer that is looked at again; a fact may hold several times
+    Rule(
+        "clocks",
+        Status.NOT_CONVERGED,
+        "The times of the rows have not converged: {clocks} still moves from round to round.",
+    ),
+    Rule("unseen", Status.NOT_CONVERGED, "{unseen} while other answers were looked for."),
+    Rule("interrupted", Status.NOT_CONVERGED, ""),
+    Rule(
+        "gauge",
+        Status.GAUGE,
+        "The estimate ran {gauge.far:.1f} prior sd along {gauge.name}, which no row fixes: it is invalid. Survey"
+        " or fix what holds it.",
+    ),
+    Rule(
+        "along",
+        Status.CONVERGED,
+        "The estimate lies {along.far:.1f} prior sd along {along.name}: check the stated network.",
+    ),
+    Rule(
+        "strained",
+        Status.CONVERGED,
+        'The start of target "{strained[0]}" was never declared and strains the fit by {strained[1]:.1f} sd: declare'
+        " it, Target(motion, start={{...}}).",
+    ),
+    Rule("equal", Status.CONVERGED, "Another answer fits as well ({equal[0]:.1f} nats apart): {equal[1]}."),
+    Rule("worse", Status.CONVERGED, "Another answer fits {worse[0]:.1f} nats worse only: {worse[1]}."),
+    Rule(
+        "node",
+        Status.CONVERGED,
+        "Survey on which side of the path such a node stands, or narrow its scale to less than that.",
+    ),
+    Rule(
+        "side",
+        Status.CONVERGED,
+        "Survey a position off that {side}, or declare on which side a target starts, Target(motion, start={{...}}).",
+    ),
 )
 
 
-def judge(rules: Sequence[Rule], facts: Mapping[str, Any]) -> tuple[Status, str]:
-    """Status and sentences of the rules whose facts are known; of a climb the first of them alone."""
-    known = [rule for rule in rules if rule.fact in facts][: 1 if rules is CLIMB else None]
+def judge(rules: Sequence[Rule], facts: Mapping[str, Any], status: Status = Status.CONVERGED) -> tuple[Status, str]:
+    """The gravest status, and all sentences, of the rules whose facts hold; of a climb the first of them alone.
+
+    `status` is what an answer has that is judged again.
+    """
+    known = [rule for rule in rules if facts.get(rule.fact)][: 1 if rules is CLIMB else None]
     said = " ".join(rule.sentence for rule in known if rule.sentence).format(**facts)
-    return min((rule.status for rule in known), key=GRAVITY.index, default=Status.CONVERGED), said
+    return min([status, *(rule.status for rule in known)], key=GRAVITY.index), said

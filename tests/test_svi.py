@@ -12,10 +12,11 @@ from probcal.gaussian.mode import smooth_tracks
 from probcal.inference.guides import GuideParameters, Structured
 from probcal.inference.mixed import mixing
 from probcal.inference.pose import pareto_khat
-from probcal.inference.posterior import judge_chains
+from probcal.inference.posterior import facts_of
 from probcal.inference.progress import Monitor
 from probcal.inference.sampling import sample
 from probcal.modes import automatic_start
+from probcal.status import CHAINS, judge
 
 ALARM = 5.0  # standard errors: a right sampler fails one comparison in a million
 
@@ -75,8 +76,7 @@ def test_a_guide_that_does_not_fit_has_not_converged(khat, status, monkeypatch):
     monkeypatch.setattr("probcal.inference.posterior.pareto_khat", lambda _: khat)
     run, _ = solved("plane", SVI(chains=2, warmup=50, draws=1000), Gaussian())
     problem = linear("plane")[0]
-    mean = smooth_tracks(problem.model, resting(problem)._replace(z=jnp.asarray(run.z.mean((0, 1)))))
-    ended, message = judge_chains(problem, Gaussian(), run, mixing(run.z), mean)
+    ended, message = judge(CHAINS, facts_of(problem, Gaussian(), run, mixing(run.z)))
     assert str(ended) == status
     assert ("it stands for the posterior" in message) == (status == "converged")
     assert ("it does not fit the posterior; fit with NUTS() or Collapsed()" in message) == (status != "converged")

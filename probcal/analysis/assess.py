@@ -83,7 +83,7 @@ def assess(
 
 
 def _absurd(tree: xr.DataTree) -> bool:
-    return bool(tree.attrs["status"] == "misfit")
+    return not Status(tree.attrs["status"]).explains
 
 
 def _assessed(fit: Judged, tree: xr.DataTree, truth: Truth | None, key: jax.Array) -> xr.DataTree:

@@ -116,7 +116,7 @@ def judge_biases(
         far, part = known.pull[m] > known.limit, explained[m]
         elsewhere = f"{beyond}, by a misfit elsewhere: it explains {part:.1g} of the excess of the innovations"
         cases = (  # the first that holds counts
-            (status is Status.MISFIT, "conflicting", "the fit ended misfit: model and data contradict each other"),
+            (not status.explains, "conflicting", "the fit ended misfit: model and data contradict each other"),
             (m in drifts, "drifting", drifts.get(m, "")),
             (far and part >= PART, "conflicting", beyond),
             (m in disagreements, "conflicting", disagreements.get(m, "")),

@@ -108,8 +108,12 @@ def uncertain(labels: Sequence[str], mixed: Integrated) -> str:
 def conclude_at(
     problem: Problem, method: Iterated, prior: Prior, posterior: Posterior, trace: np.ndarray, square: float,
     iterations: int, *, converged: bool, refused: bool, evidence: float, lost: float = 0.0, stopped: str = "",
+    steps: np.ndarray | None = None, **others: Any,
 ) -> Answer:  # fmt: skip
-    """The answer of a climb that ended at a posterior: whether it converged, never left its start, lost evidence."""
+    """The answer of a climb that ended at a posterior: whether it converged, never left its start, lost evidence.
+
+    `others` are further facts that `probcal.status.CLIMB` knows, or the same otherwise.
+    """
     point, summary = posterior.point, posterior.summary
     low, far = low_and_far(prior, summary, problem.surveyed)
     cut = bool(stopped) and not converged and iterations < method.iterations
@@ -120,18 +124,22 @@ def conclude_at(
     def named(mask: np.ndarray) -> str:
         return listed([label for label, hit in zip(problem.labels, mask, strict=True) if hit], 12)
 
-    known = {
-        "misfit": misfit_sentence(problem, point, square), "far": named(far),
+    facts = {
+        "iterations": iterations, "limit": FAR, "far": named(far),
         "singular": not (posterior.sound and np.isfinite(evidence)), "refused": refused, beyond: named(low),
         "fallen": 0.0 if cut or lost <= FALL else lost, "converged": converged,
         "cut": f"{stopped} after {iterations} iteration{'s' * (iterations > 1)}" if cut else "",
-        "moved": f"{moved:.2g}" if asked and np.isfinite(moved) else "", "spent": asked,
+        "moved": f"the last moved the objective by {moved:.2g}" if asked and np.isfinite(moved) else "",
+        "spent": asked, **others,
     }  # fmt: skip
-    facts = {"iterations": iterations, "limit": FAR} | {name: value for name, value in known.items() if value}
+    if "misfit" not in others:
+        facts["misfit"] = misfit_sentence(problem, point, square)
     status, message = judge(CLIMB, facts)
     ended = _bias_status(problem, summary, low, far)
     message = " ".join(part for part in (message, method.remark(prior)) if part)
-    return Answer(problem, method, method, prior, posterior, status, message, ended, iterations, trace, interrupted=cut)
+    return Answer(
+        problem, method, method, prior, posterior, status, message, ended, iterations, trace, steps, interrupted=cut
+    )
 
 
 def _bias_status(problem: Problem, summary: Summary, low: np.ndarray, far: np.ndarray) -> tuple[str, ...]:

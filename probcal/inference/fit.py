@@ -39,7 +39,7 @@ from probcal.results.answer import Answer, tracks_of
 from probcal.results.build import add_mirrors, add_optima, bands, build, build_tracks
 from probcal.results.read import apply
 from probcal.simulate import Key, as_key
-from probcal.status import Status
+from probcal.status import FOUND
 from probcal.types import float64
 from probcal.wings import of_wing
 
@@ -164,9 +164,8 @@ def _interrupted(answer: Answer, monitor: Monitor) -> Answer:
     """The answer, marked where Ctrl-C ended the search for it or for others."""
     if not monitor.signal:
         return answer
-    status = answer.status.unsettled
-    said = "" if monitor.stopped in answer.message else f"{monitor.stopped} while other answers were looked for."
-    return replace(answer, interrupted=True, status=status, message=f"{said} {answer.message}".strip())
+    unseen = "" if monitor.stopped in answer.message else monitor.stopped
+    return replace(answer.judged(FOUND, interrupted=True, unseen=unseen), interrupted=True)
 
 
 def _directions(answer: Answer) -> tuple[tuple[Direction, ...], int]:
@@ -190,7 +189,7 @@ def linear_form(answer: Answer) -> bool:
 
 def _advised(answer: Answer, directions: Sequence[Direction], count: int) -> str:
     """The message of an answer, with what the data leave open; a misfit is not for lack of data."""
-    if not directions or answer.status is Status.MISFIT:
+    if not directions or not answer.status.explains:
         return answer.message
     named = "; ".join(direction.sentence for direction in directions[:NAMED])
     named += f"; and {count - NAMED} more" if count > NAMED else ""
@@ -203,41 +202,25 @@ def _watched(answer: Answer) -> Answer:
     problem, point = answer.problem, answer.posterior.point
     if not linear_form(answer) or not answer.status.valid or not np.isfinite(np.asarray(point.z)).all():
         return answer
-    found, status = [answer.message] if answer.message else [], answer.status
+    found = answer
     for run in runs(problem, point, many=not answer.posterior.summary.covariance.whole):
-        if run.gauge:
-            status = Status.GAUGE
-            found.append(
-                f"The estimate ran {run.far:.1f} prior sd along {run.name}, which no row fixes: it is invalid. Survey"
-                " or fix what holds it."
-            )
-        else:
-            found.append(f"The estimate lies {run.far:.1f} prior sd along {run.name}: check the stated network.")
-    if answer.motion == "used":
-        found += [
-            f'The start of target "{name}" was never declared and strains the fit by {far:.1f} sd: declare it, '
-            "Target(motion, start={...})."
-            for name, far in strained_starts(problem, point)
-        ]
-    found += [_mirrored(answer, other) for other in answer.mirrors]
+        found = found.judged(FOUND, **{"gauge" if run.gauge else "along": run})
+    for strained in strained_starts(problem, point) if answer.motion == "used" else ():
+        found = found.judged(FOUND, strained=strained)
+    for other in answer.mirrors:
+        near = "worse" if other.gain <= -SAME else "equal"
+        found = found.judged(FOUND, **{near: (abs(other.gain), _place(answer, other))})
     alike = {other.kind for other in answer.mirrors if other.gain > -SAME}
-    if NODE in alike:
-        found.append("Survey on which side of the path such a node stands, or narrow its scale to less than that.")
-    if alike - {NODE, START}:
-        word, side = "line" if problem.network.dimension == 2 else "plane", "declare on which side a target starts"
-        found.append(f"Survey a position off that {word}, or {side}, Target(motion, start={{...}}).")
-    return replace(answer, status=status, message=" ".join(found))
+    side = "line" if problem.network.dimension == 2 else "plane"
+    return found.judged(FOUND, node=NODE in alike, side=side if alike - {NODE, START} else "")
 
 
-def _mirrored(answer: Answer, other: Mirrored) -> str:
-    """What to say of an answer on the other side of a mirror."""
+def _place(answer: Answer, other: Mirrored) -> str:
+    """The place of an answer on the other side of a mirror, and the biases that differ there."""
     problem = answer.problem
     away = np.abs(other.shift) / np.maximum(answer.posterior.here[1], 1e-12)
     labels = [problem.labels[m] for m in np.argsort(-away) if away[m] > DIFFERENT]
-    where = f"{other.name}, " + (f"with other {listed(labels, NAMED)}" if labels else "the biases alike")
-    if other.gain <= -SAME:
-        return f"Another answer fits {-other.gain:.1f} nats worse only: {where}."
-    return f"Another answer fits as well ({abs(other.gain):.1f} nats apart): {where}."
+    return f"{other.name}, " + (f"with other {listed(labels, NAMED)}" if labels else "the biases alike")
 
 
 def _check_store(method: Method, store: str | PathLike[str] | None, resume: bool, overwrite: bool) -> None:

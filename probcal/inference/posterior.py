@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
@@ -27,7 +27,7 @@ from probcal.problem import Problem
 from probcal.results.answer import Answer, Draws, Posterior, Summary, Tracks, log_prior_normal
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL, ROPE
-from probcal.status import CHAINS, Status, judge
+from probcal.status import CHAINS, judge
 
 RARE = 0.05  # share of leaps, or of swings, taken below which it is said
 # Pareto k-hat from which importance weights, and so a guide, are unreliable (Vehtari et al. 2024)
@@ -111,17 +111,23 @@ def _numbers(run: SamplerRun) -> dict[str, float]:
 
 
 def conclude_draws(
-    problem: Problem, prior: Prior, run: SamplerRun, posterior_of: Callable[..., Chains] = Chains.of
-) -> Answer:
-    """The answer of a sampler's run."""
+    problem: Problem, prior: Prior, run: SamplerRun, posterior_of: Callable[..., Chains] = Chains.of,
+    misfit: Callable[[Problem, Point], str] | None = None, **facts: Any,
+) -> Answer:  # fmt: skip
+    """The answer of a sampler's run; `misfit` says why its mean explains nothing, `facts` are further ones."""
     mixed = mixing(within_sides(np.asarray(run.draws.theta), run.side))
     posterior = posterior_of(problem, prior, run, mixed)
-    status, message = judge_chains(problem, prior, run, mixed, posterior.point)
+    unexplained = (misfit or _misfit)(problem, posterior.point)
+    status, message = judge(CHAINS, facts_of(problem, prior, run, mixed) | facts | {"misfit": unexplained})
     ended = bias_status(problem, mixed, run.form.biases)
     return Answer(
         problem, run.method, run.asked, prior, posterior, status, message, ended, run.z.shape[1],
         interrupted=bool(run.stopped), mirrors=_mirrors(run),
     )  # fmt: skip
+
+
+def _misfit(problem: Problem, point: Point) -> str:
+    return misfit_sentence(problem, point, float(mean_square(problem.model, point)))
 
 
 def heaviest(run: SamplerRun) -> int:
@@ -212,36 +218,37 @@ def bias_status(problem: Problem, mixed: Mapping[str, np.ndarray], M: int) -> tu
     return tuple("not mixed" if bad else words[b.kind] for b, bad in zip(problem.biases, lost, strict=True))
 
 
-def judge_chains(
-    problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray], mean: Point
-) -> tuple[Status, str]:
-    """Status of a run whose posterior has this mean, and one or more sentences on what hurts and what to do."""
-    chains, draws = run.z.shape[:2]
-    names = [*problem.labels, *(level.label for level in problem.levels)]
-    facts: dict[str, Any] = {"note": run.note} if run.note else {}
+def facts_of(problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """What a run says of its draws, in the names of `probcal.status.CHAINS`."""
+    draws, names = run.z.shape[1], [*problem.labels, *(level.label for level in problem.levels)]
+    facts: dict[str, Any] = {"note": run.note} | mixed_of(names, mixed, run.z.shape[0])
     if run.stopped:
         how = f"after {draws} of {run.method.draws} draws a chain"
         again = "while more steps were made, as the draws had not mixed"
         facts["stopped"] = f"{run.stopped} {again if draws == run.method.draws else how}"
-    if "r_hat" in mixed and mixed["r_hat"].max() > R_HAT:
-        facts["r_hat"] = names[int(mixed["r_hat"].argmax())], mixed["r_hat"].max()
-    worst = int(mixed["ess"].argmin())
-    if mixed["ess"][worst] < ESS * chains:
-        facts["few"] = names[worst], mixed["ess"][worst]
     share, error = weights_of_sides(run.side, len(run.sides) + 1)
     if np.count_nonzero(share) > 1:
         listed = ", ".join(f"{share[k]:.2f} ± {error[k]:.2f}" for k in np.flatnonzero(share))
         facts["sides"] = np.count_nonzero(share), listed
-        facts |= {"unsure": True} if error.max() > UNSURE else {}
-    if misfit := misfit_sentence(problem, mean, float(mean_square(problem.model, mean))):
-        return judge(CHAINS, facts | {"misfit": misfit})
+        facts["unsure"] = error.max() > UNSURE
     facts |= _steps(run)
     if not run.method.exact:
         khat = pareto_khat(_stats(run)["log_weight"].ravel())
         facts["fitting" if khat < K_HAT else "unfitting"] = khat, K_HAT
     if isinstance(prior, Flat) and (np.abs(run.z.mean((0, 1))[~problem.surveyed]) > FAR).any():
         facts["far"] = True
-    return judge(CHAINS, facts)
+    return facts
+
+
+def mixed_of(names: Sequence[str], mixed: Mapping[str, np.ndarray], chains: int, limit: Any = R_HAT) -> dict[str, Any]:
+    """Quantities whose chains have not mixed, or have few effective draws, worst first; `limit` is of each r_hat."""
+    facts, few = dict[str, Any](), int(mixed["ess"].argmin())
+    if "r_hat" in mixed:
+        above = mixed["r_hat"] - limit
+        worst = int(above.argmax())
+        facts["r_hat"] = (names[worst], mixed["r_hat"][worst]) if above[worst] > 0 else ()
+    facts["few"] = (names[few], mixed["ess"][few]) if mixed["ess"][few] < ESS * chains else ()
+    return facts
 
 
 def _steps(run: SamplerRun) -> dict[str, Any]:
@@ -259,8 +266,8 @@ def _steps(run: SamplerRun) -> dict[str, Any]:
     rate = found["acceptance_rate"].mean(1) if "acceptance_rate" in found else np.ones(1)
     if "swung" in found:
         taken = found["swung"].mean(1).min()
-        facts |= {"accepted": rate.mean()} if rate.mean() < RARE else {}
-        facts |= {"hmc": taken} if taken < RARE else {}
+        facts["accepted"] = (rate.mean(),) if rate.mean() < RARE else ()
+        facts["hmc"] = (taken,) if taken < RARE else ()
     if run.method.refusal and rate.min() < RARE:
         facts["turns"] = rate.min(), run.method.refusal
     return facts

@@ -26,7 +26,7 @@ from probcal.modes.reflections import new, reach
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.status import Status
+from probcal.status import FOUND
 
 ELSEWHERE = "found from another start"
 ROUNDS = 8  # answers in turn, each with the rows where the one before puts them
@@ -67,8 +67,7 @@ def solve(
             return answer
         problem, start = taken_there(problem, answer.posterior.point)
     moving = [problem.labels[m] for m in np.flatnonzero(away > STILL * summary.sd)]
-    said = f"The times of the rows have not converged: {listed(moving, 3)} still moves from round to round."
-    return answer.noted(said, status=answer.status.unsettled)
+    return answer.judged(FOUND, clocks=listed(moving, 3))
 
 
 def _solve(
@@ -205,7 +204,7 @@ def _by_particles(
         key = context.key if k == 0 else jax.random.fold_in(context.key, 1 + k)
         point = Point((), (), jnp.asarray(z), jnp.zeros(len(problem.levels)))
         tries = [method.answer(problem, prior, point, context._replace(key=key))]
-        while method.climbs and tries[-1].status in (Status.NOT_CONVERGED, Status.MISFIT) and len(tries) < TRIES:
+        while method.climbs and tries[-1].status.again and len(tries) < TRIES:
             if context.monitor.stopped:
                 break
             other = context._replace(key=jax.random.fold_in(key, len(tries)))

@@ -42,7 +42,6 @@ from probcal.particles.weighted import Paths, check_learnt, louis, prepared, une
 from probcal.priors import Gaussian, Horseshoe, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.status import Status
 
 SPREAD = 1.5  # by how much chains start further out than the data leave the biases
 SEARCH = 40  # iterations of the search for a start, where there is none
@@ -145,13 +144,9 @@ class ParticleGibbs(Sampler):
             self, self, form, natural, None, drawn, time.perf_counter() - began, stopped, "", (), thin, paths
         )  # fmt: skip
         linear = all(part is None for part in problem.model.sampled)
-        answer = conclude_draws(problem if linear else problem.seen(), prior, run, ParticleChains.of)
-        if misfit := unexplained(answer.posterior.problem, answer.posterior.point):
-            return replace(answer, status=Status.MISFIT, message=misfit)
-        if (share := float(np.mean(drawn.stats["renewed"]))) < STUCK:
-            more = f"A sweep renews {share:.0%} of the paths only: take more particles."
-            answer = answer.noted(more, status=answer.status.unsettled)
-        return answer
+        share, solved = float(np.mean(drawn.stats["renewed"])), problem if linear else problem.seen()
+        renewed = (share,) if share < STUCK else ()
+        return conclude_draws(solved, prior, run, ParticleChains.of, unexplained, renewed=renewed)
 
     def step(self, form: Form, posed: Any, chain: GibbsState) -> tuple[GibbsState, Sample]:
         """One sweep; `posed` is what is `Held`."""

@@ -15,7 +15,7 @@ from probcal.errors import InputError
 from probcal.gaussian.draws import draw_biases, draws_a_chain, predictive
 from probcal.gaussian.information import rejected
 from probcal.gaussian.mode import Point
-from probcal.inference.ending import ABSURD, FAR, low_and_far
+from probcal.inference.ending import ABSURD, conclude_at
 from probcal.inference.method import Given
 from probcal.labels import listed
 from probcal.linalg import cholesky, invert, orthogonalise, without_negative
@@ -47,7 +47,7 @@ from probcal.results.answer import (
 from probcal.results.blocks import SensorBlocks
 from probcal.results.build import build_tracks
 from probcal.results.groups import Band
-from probcal.status import Status
+from probcal.status import CLIMB, Status, judge
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -325,7 +325,7 @@ def conclude_particles(
 ) -> Answer:  # fmt: skip
     """The answer of a climb by particles."""
     paths, keys = Paths(problem, how, targets), jax.random.split(key)
-    z, levels, M = np.asarray(ended.z), np.asarray(ended.levels), problem.model.biases
+    z, levels = np.asarray(ended.z), np.asarray(ended.levels)
     told = louis(paths, z, levels, keys[0])
     now = given.prior._replace(alpha=ended.alpha)
     slope = score_slope(paths, told, np.asarray(now.matrix()), z, levels, jax.random.fold_in(key, 2))
@@ -340,15 +340,18 @@ def conclude_particles(
     )  # fmt: skip
     numbers = {"log_likelihood": told.log_likelihood, "log_likelihood_se": told.error, "particles": float(how.count)}
     posterior = posterior_of(paths, prior, summary, told, keys[1], numbers)
-    low, far = low_and_far(prior, summary, problem.surveyed)
     ahead = steepness(told.score - np.asarray(now.matrix()) @ z, covariance, told.noise)
-    status, message = _judged(posterior, method, ended, bool(low.any()), bool(far.any()), ahead, slope)
-    words = np.select(
-        [problem.surveyed, low, far], ["survey", "at bound", "diverged"], "estimated"
-    ).tolist() if M else []  # fmt: skip
-    return Answer(
-        posterior.problem, method, method, prior, posterior, status, message, tuple(words), len(ended.trace),
-        ended.trace, ended.steps, bool(ended.stopped),
+    error, stopped = float(np.max(slope.sd_error, initial=0.0)), bool(ended.stopped)
+    worst = problem.labels[int(np.argmax(slope.sd_error))] if error else ""
+    left, asked = notable_scatter(posterior.problem, posterior.point), method.tolerance == 0
+    return conclude_at(
+        posterior.problem, method, prior, posterior, ended.trace, np.nan, len(ended.trace), converged=ended.still,
+        refused=False, evidence=told.log_likelihood, stopped=ended.stopped, steps=ended.steps,
+        misfit=unexplained(posterior.problem, posterior.point),
+        left=0.0 if stopped else left, ahead=ahead if ahead > AHEAD and not stopped else 0.0,
+        inexact=(worst, error, slope.filters) if error > SD_ERROR and not stopped else (),
+        better="more particles" if how.m_step == "averaged" else 'm_step="averaged", more particles',
+        moved=ended.said if asked else "", moving="" if asked else ended.said,
     )  # fmt: skip
 
 
@@ -397,27 +400,16 @@ def track_by_particles(
     tracks = paths.over(drawn, levels, keys[3]).tracks
     seen = problem.seen()
     tree = build_tracks(seen, [Band(t.mean, t.sd, np.asarray(m.mean)) for t, m in zip(tracks, zero, strict=True)])
-    status, message = judged_tracks(seen, point, found)
+    status, message = judge_tracks(seen, point, found)
     tree.attrs |= {"status": str(status), "message": message, "smoother": repr(how)}
     return tree
 
 
-def judged_tracks(problem: Problem, point: Point, found: Ensemble) -> tuple[Status, str]:
+def judge_tracks(problem: Problem, point: Point, found: Ensemble) -> tuple[Status, str]:
     """Status of tracks by particles at known biases, and a sentence: whether they explain the rows, and are enough."""
-    if misfit := unexplained(problem, point):
-        return Status.MISFIT, misfit
-    square, count = scatter(problem, point)
-    if square > max(SCATTER, 1 + SURE * np.sqrt(2 / count)):
-        return Status.NOT_CONVERGED, (
-            f"What is left of the rows has a mean square of {square:.1f} where 1 is expected: particles lost a target,"
-            " or its motion, the calibration or the noise std is not right. Take more particles."
-        )
-    if (least := fewest(found)) < FEW:
-        return Status.NOT_CONVERGED, (
-            f"At some epoch only {least} of the smoothed particles differ, so that their spread says little: take more"
-            ' of them, or Particles(proposal="extended") where the motion has a linear form.'
-        )
-    return Status.CONVERGED, ""
+    least = fewest(found)
+    facts = {"lost": notable_scatter(problem, point), "alike": str(least) if least < FEW else "", "converged": True}
+    return judge(CLIMB, facts | {"misfit": unexplained(problem, point)})
 
 
 def fewest(found: Ensemble) -> int:
@@ -448,50 +440,8 @@ def unexplained(problem: Problem, point: Point) -> str:
     )
 
 
-def scatter(problem: Problem, point: Point) -> tuple[float, float]:
-    """Mean square of what a point leaves of all data, about 1 or less where the model is right, and their number."""
-    total, count = (
-        sum(float(np.sum(part)) for part in parts) for parts in squares_by_epoch(problem.model, point)
-    )  # fmt: skip
-    return total / max(count, 1.0), max(count, 1.0)
-
-
-def _judged(
-    posterior: EnsemblePosterior, method: Any, ended: Ended, low: bool, far: bool, ahead: float, slope: ScoreSlope
-) -> tuple[Status, str]:
-    """Status of a climb by particles, and a sentence; `ahead` is how far a Newton step would go, in sd a bias."""
-    if misfit := unexplained(posterior.problem, posterior.point):
-        return Status.MISFIT, misfit
-    if far or not posterior.sound:
-        where = f"some biases lie more than {FAR:g} scales away" if far else "the information is singular"
-        return Status.DIVERGED, f"The fit diverged: {where}; the estimate is invalid. Use a prior, or fix some biases."
-    if low:
-        return Status.AT_BOUND, "A precision stands at its lower bound: the estimate is invalid."
-    if ended.stopped:
-        return Status.NOT_CONVERGED, (
-            f"{ended.stopped} after {len(ended.trace)} iterations, before it converged: this is the best estimate so"
-            " far."
-        )
-    better = "more particles" if posterior.paths.how.m_step == "averaged" else 'm_step="averaged", more particles'
-    square, count = scatter(posterior.problem, posterior.point)
-    if square > max(SCATTER, 1 + SURE * np.sqrt(2 / count)):
-        return Status.NOT_CONVERGED, (
-            f"What is left of the rows has a mean square of {square:.1f} where 1 is expected: another optimum may"
-            f" explain them, or the noise std is too small. Take {better} or further starts."
-        )
-    if ahead > AHEAD:
-        return Status.NOT_CONVERGED, (
-            f"The slope of the likelihood where the fit ended asks for a step of {ahead:.1f} sd a bias: it is not the"
-            f" top. Take {better} or more iterations."
-        )
-    if (error := float(np.max(slope.sd_error, initial=0.0))) > SD_ERROR:
-        worst = posterior.problem.labels[int(np.argmax(slope.sd_error))]
-        return Status.NOT_CONVERGED, (
-            f"The sd of {worst} has a Monte Carlo error of {error:.0%} after {slope.filters} filters: take more"
-            " particles."
-        )
-    if ended.still:
-        return Status.CONVERGED, ""
-    if method.tolerance == 0:
-        return Status.SPENT, f"All {len(ended.trace)} iterations were run, as asked; {ended.said}."
-    return Status.NOT_CONVERGED, f"The fit did not settle in {len(ended.trace)} iterations: {ended.said}; allow more."
+def notable_scatter(problem: Problem, point: Point) -> float:
+    """Mean square of what a point leaves of all data where it is notably above the 1 of a right model; else 0."""
+    total, count = (sum(float(np.sum(part)) for part in parts) for parts in squares_by_epoch(problem.model, point))
+    square = total / max(count, 1.0)
+    return square if square > max(SCATTER, 1 + SURE * np.sqrt(2 / max(count, 1.0))) else 0.0

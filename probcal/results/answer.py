@@ -25,7 +25,7 @@ from probcal.modes.mirrors import Mirrored
 from probcal.priors import PRECISION_BOUNDS, Prior
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL
-from probcal.status import Status
+from probcal.status import Rule, Status, judge
 
 if TYPE_CHECKING:
     from probcal.problem import Problem
@@ -277,6 +277,11 @@ class Answer:
     def noted(self, said: str, **changes: Any) -> Answer:
         """The answer with a further sentence in its message, and other changes."""
         return replace(self, message=f"{self.message} {said}".strip(), **changes)
+
+    def judged(self, rules: Sequence[Rule], **facts: Any) -> Answer:
+        """The answer with the status and the sentences that follow from further facts."""
+        status, said = judge(rules, facts, self.status)
+        return self.noted(said, status=status)
 
     @property
     def objective(self) -> float:

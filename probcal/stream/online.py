@@ -28,7 +28,7 @@ from probcal.priors import AnyPrior, Gaussian, Horseshoe, Prior, as_prior
 from probcal.problem import Problem, fixed_biases
 from probcal.results.answer import HALF
 from probcal.results.read import apply, held_by
-from probcal.status import Status
+from probcal.status import STREAM, Status, judge
 from probcal.stream.arrivals import Arrivals, Batch, padded, refused_rows
 from probcal.stream.counted import Counted
 from probcal.stream.filters import belief as beliefs
@@ -284,22 +284,19 @@ class Online:
     @property
     def message(self) -> str:
         """Reasons against the answer, each with its remedy; empty if there are none."""
-        return f"{self.doubtful} {self.check.text()}".strip()
+        return f"{self._judged()[1]} {self.check.text()}".strip()
 
-    @property
-    def doubtful(self) -> str:
-        """Why intervals may be too narrow; empty where nothing speaks against them."""
-        found, windows, astray = [], self.doubts["windows"], self.doubts["targets"]
-        if windows:
-            found.append(f"{windows} window{'s' * (windows > 1)} did not come to rest: fit the rows as a batch.")
-        if astray:
-            found.append(
-                f"{astray} target{'s' * (astray > 1)} began where the first rows do not give a place: declare the"
-                " start, Target(motion, start={...}), or take a lag."
-            )
-        if self.cloud is not None and (left := particles.ancestors(self.cloud)) < ANCESTORS:
-            found.append(f"{left} of the first particles are left: take more, or AugmentedFilter() where it serves.")
-        return f"Intervals may be too narrow. {' '.join(found)}" if found else ""
+    def _judged(self) -> tuple[Status, str]:
+        """The status, and why intervals may be too narrow."""
+        windows, astray, left = self.doubts["windows"], self.doubts["targets"], ANCESTORS
+        if self.cloud is not None:
+            left = particles.ancestors(self.cloud)
+        facts = {
+            "windows": f"{windows} window{'s' * (windows > 1)}" if windows else "",
+            "astray": f"{astray} target{'s' * (astray > 1)}" if astray else "",
+            "ancestors": str(left) if left < ANCESTORS else "",
+        }
+        return judge(STREAM, facts | {"narrow": any(facts.values()), "unexplained": bool(self.check.unexplained)})
 
     @property
     def alarmed(self) -> bool:
@@ -309,9 +306,7 @@ class Online:
     @property
     def status(self) -> Status:
         """Status of the calibration, by the rules of fits."""
-        if self.check.unexplained:
-            return Status.MISFIT
-        return Status.NOT_CONVERGED if self.doubtful else Status.CONVERGED
+        return self._judged()[0]
 
     @property
     def labels(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from probcal.lazy import Later
 from probcal.priors import Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.status import Status
+from probcal.status import OBJECTS, judge
 from probcal.tracking.configure import Configured, Rounds, configure
 from probcal.tracking.groups import belief_group, disagreeing, with_objects
 
@@ -106,9 +106,9 @@ class SelfConfiguration(Method):
                 " Detection(...)."
             )
         tree, answer = fit(found.labelled, self.method)
-        status, wrong = _doubts(found, answer.posterior.summary.mean, self.name)
-        if wrong and Status(tree.attrs["status"]).settled:
-            answer = replace(answer, status=status, message=f"{' '.join(wrong)} {answer.message}".strip())
+        if answer.status.settled:
+            status, said = judge(OBJECTS, _facts(found, answer.posterior.summary.mean, self.name), answer.status)
+            answer = replace(answer, status=status, message=f"{said} {answer.message}".strip())
             tree.attrs |= {"status": str(answer.status), "message": answer.message}
         objects, scans = len(found.objects.names), len(problem.scans or ())
         said = f"{objects} objects in {scans} scans, found in {found.rounds} rounds of {self.name}."
@@ -125,26 +125,13 @@ class SelfConfiguration(Method):
         return self.method.answer(problem, prior, start, context)
 
 
-def _doubts(found: Configured, z: np.ndarray, name: str) -> tuple[Status, list[str]]:
-    """The status of objects and biases that do not agree, and sentences; no sentence where they do. Biases z (M,)."""
-    status, wrong = Status.NOT_CONVERGED, []
-    if not found.rests:
-        wrong.append(f"{name} did not come to rest in {found.rounds} rounds: objects and biases still change.")
-    if found.beliefs is not None and found.beliefs.apart:
-        wrong.append(
-            f"The objects of {', '.join(found.beliefs.apart)} do not tell how they stand to the other sensors: their"
-            " biases are not found; give more common objects that turn, or state the pose."
-        )
-    if found.beliefs is not None and found.beliefs.rivals:
-        listed = ", ".join(f"{name} ({1 + count})" for name, count in found.beliefs.rivals.items())
-        wrong.append(
-            f"Several poses explain the detections as well (how many): {listed}. Survey one of these, or give objects"
-            " that turn."
-        )
-    for a, first, b, second in disagreeing(found.problem, found.objects, z)[:1]:
-        status = Status.MISFIT
-        wrong.append(
-            f"{a} should see {first} and never does, {b} should see {second} and never does: the two differ by what no"
-            " bias allows for. Check their clocks and Detection(...), or give the sensor a bias for it."
-        )
-    return status, wrong
+def _facts(found: Configured, z: np.ndarray, name: str) -> dict[str, Any]:
+    """Objects and biases that do not agree, in the names of `probcal.status.OBJECTS`. Biases z (M,)."""
+    beliefs = found.beliefs
+    rivals = {} if beliefs is None else beliefs.rivals
+    return {
+        "method": name, "rounds": found.rounds, "moving": not found.rests,
+        "apart": "" if beliefs is None else ", ".join(beliefs.apart),
+        "rivals": ", ".join(f"{name} ({1 + count})" for name, count in rivals.items()),
+        "disagree": next(iter(disagreeing(found.problem, found.objects, z)), ()),
+    }  # fmt: skip

@@ -13,7 +13,8 @@ import numpy as np
 
 from probcal.errors import InputError
 from probcal.inference.hierarchy import Hierarchy, Phi, hierarchy_of
-from probcal.inference.mixed import ESS, R_HAT, mixing
+from probcal.inference.mixed import R_HAT, mixing
+from probcal.inference.posterior import mixed_of
 from probcal.lazy import Later
 from probcal.noise import Unknown
 from probcal.priors import PRECISION_BOUNDS, AnyPrior, Gaussian, Prior, as_prior
@@ -22,7 +23,7 @@ from probcal.results.groups import bias_coords, constant_group
 from probcal.results.read import apply
 from probcal.results.schema import INTERVAL
 from probcal.simulate import Key, as_key
-from probcal.status import Status
+from probcal.status import CHAINS, judge
 from probcal.tracking.entry import asked
 from probcal.tracking.objects import Objects, track_objects
 from probcal.tracking.sampler.moves import ALL_SCANS, MOVES, ONE_SCAN, SWAP, TRACK, Standing, move
@@ -330,7 +331,7 @@ def _tree(problem: Problem, kept: AssociationDraw, rows: np.ndarray, schedule: S
     if (rows >= 0).sum() <= TOGETHER:
         groups["together"] = co_association(flat, rows)
     tree = xr.DataTree.from_dict(groups)
-    status, message = _judged(problem, mixed, number, C, N, T)
+    status, message = judge(CHAINS, _facts(problem, mixed, number, C, T))
     tree.attrs |= {"status": str(status), "message": message, "objects": float(number.mean())}
     return tree
 
@@ -375,27 +376,14 @@ def _calibration(problem: Problem, kept: AssociationDraw, mixed: dict[str, np.nd
     return xr.Dataset(values, coords={**bias_coords(problem), "bias_label_other": list(problem.labels)})
 
 
-def _judged(
-    problem: Problem, mixed: dict[str, np.ndarray], number: np.ndarray, chains: int, draws: int, most: int
-) -> tuple[Status, str]:
-    """Status of the draws, and sentences on what hurts."""
+def _facts(
+    problem: Problem, mixed: dict[str, np.ndarray], number: np.ndarray, chains: int, most: int
+) -> dict[str, Any]:
+    """What hurts of the draws, in the names of `probcal.status.CHAINS`."""
     names = [*problem.labels, "the number of objects", "the number of detections of objects", "the log density"]
-    said, status = [f"{number.mean():.2f} objects in {len(problem.scans or ())} scans."], Status.CONVERGED
-    if "r_hat" not in mixed:
-        said.append("One chain alone does not show whether it has mixed; take 2 or more.")
-    else:
-        apart = mixed["r_hat"] - np.where(np.arange(len(names)) < len(problem.labels), R_HAT, NUMBERS)
-        worst = int(apart.argmax())
-        if apart[worst] > 0:
-            said.append(
-                f"The chains have not mixed: r_hat of {names[worst]} is {mixed['r_hat'][worst]:.3f}; take more draws."
-            )
-            status = Status.NOT_CONVERGED
-    worst = int(mixed["ess"].argmin())
-    if mixed["ess"][worst] < ESS * chains:
-        said.append(f"Only {mixed['ess'][worst]:.0f} effective draws of {names[worst]}; take more draws.")
-        status = Status.NOT_CONVERGED
+    limits = np.where(np.arange(len(names)) < len(problem.labels), R_HAT, NUMBERS)
     full = float((number == most).mean())
-    if full > FULL:
-        said.append(f"All {most} objects are there in {full:.0%} of the draws: give most= room for more.")
-    return status, " ".join(said)
+    return {
+        "objects": (number.mean(), len(problem.scans or ())), "single": "r_hat" not in mixed,
+        "full": (most, full) if full > FULL else (), **mixed_of(names, mixed, chains, limits),
+    }  # fmt: skip
