@@ -34,13 +34,13 @@ def run(number, tails):
     """What one run says: errors of biases and track, shares held, whether the motion is named, status, seconds."""
     problem, truth = networks.setting(number, "corners", 0.3, tails)
     began = time.perf_counter()
-    tree, answer = calibrate(problem, key=number)
+    tree, _ = calibrate(problem, key=number)
     seconds = time.perf_counter() - began
     group = tree["calibration"].to_dataset()
     true = np.array([truth.biases.get(label, 0.0) for label in problem.labels])
     held = (group["lower"].values <= true) & (true <= group["upper"].values)
     error = float(np.sqrt(np.mean(((group["mean"].values - true) / problem.scales) ** 2)))
-    findings = assess(problem, tree, answer=answer)["finding"]
+    findings = assess(problem, tree)["finding"]
     return {
         "error": error, "track": position_rmse(tree, truth)[1], "held": held.mean(),
         "nonzero": held[true != 0].mean(), "motion": "motion" in findings["kind"].values,
@@ -90,9 +90,9 @@ def recordings():
     for name, (make, truth, prior) in cases.items():
         for word, problem in (("as declared", make()), ("Student-t, 4", heavy(make()))):
             began = time.perf_counter()
-            tree, answer = calibrate(problem, prior=prior)
+            tree, _ = calibrate(problem, prior=prior)
             seconds = time.perf_counter() - began
-            findings = assess(problem, tree, answer=answer)["finding"].to_dataset()
+            findings = assess(problem, tree)["finding"].to_dataset()
             named = findings["sentence"].values[findings["kind"].values == "motion"].tolist()
             level = dict(tree["level"]["std"].to_series().round(3)) if "level" in tree.children else "known"
             error = position_rmse(tree, truth())[1]

@@ -144,10 +144,10 @@ def one(case, run):
     """What one run says: status, and (off in sd, held, non-zero, gamma, verdict) of its biases; kinds of findings."""
     problem, truth = CASES[case](run)
     try:
-        tree, answer = calibrate(problem, key=run)
+        tree, _ = calibrate(problem, key=run)
     except FitError:
         return "refused", None, []
-    tree = assess(problem, tree, answer=answer)
+    tree = assess(problem, tree)
     group = tree["calibration"].to_dataset()
     true = np.array([truth.biases.get(str(label), 0.0) for label in group["bias_label"].values])
     off = np.abs(group["mean"].values - true) / group["sd"].values

@@ -538,8 +538,8 @@ def test_an_answer_far_from_gaussian_is_weak(stated):
     drawn = simulate(Network(nodes), motion, time, key=0, share=1.0, tracks={"target": track})
     start = {"position": ((-600.0, 1000.0), 50.0), "velocity": ((20.0, 0.0), 5.0)}
     problem = Problem(Network(nodes), Target(motion, start) if stated else motion, drawn.table)
-    tree, answer = calibrate(problem, key=0)
-    checked = assess(problem, tree, answer=answer)
+    tree, _ = calibrate(problem, key=0)
+    checked = assess(problem, tree)
     kinds, words = checked["finding"]["kind"].values.tolist(), checked["verdict"]["verdict"].values.tolist()
     assert ("shape" in kinds) is (not stated)
     assert words == ["determined" if stated else "weak"] * 3

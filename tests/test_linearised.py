@@ -6,16 +6,11 @@ import numpy as np
 import pytest
 from worlds import exact, linear, resting
 
-from probcal import EA, MAP, Gaussian, assess, fit
 from probcal.gaussian.dense import DenseEngine
 from probcal.gaussian.linearised import laplace, leverages
 from probcal.gaussian.mode import find_mode
 from probcal.gaussian.solves import Dense
-from probcal.inference import calibrate
-from probcal.inference.fitted import take_up
 from probcal.priors import Precision
-from probcal.results.schema import DECLARED
-from probcal.types import float64
 
 ALARM = 5.0  # sds of a mean beyond which a draw is wrong: one false alarm in 10^6
 
@@ -74,25 +69,3 @@ def test_one_linearisation_has_all_moments():
     np.testing.assert_allclose(found.evidence, known.evidence, rtol=1e-10)
     np.testing.assert_allclose(marginals, np.diag(found.covariance), rtol=1e-10)
     assert 0 < told <= np.trace(np.asarray(found.covariance) @ np.asarray(found.information)) + 1e-9
-
-
-@float64
-@pytest.mark.ci
-def test_an_answer_handed_on_is_the_fit_taken_up_again():
-    """`assess` of a tree alone, and with the answer behind it: the same point, rows and prior."""
-    problem, _ = linear("plane")
-    prior = Gaussian(correlation={"*.position_x": 0.5})
-    for options in ({}, {"prior": prior}):
-        method = None if not options else MAP()
-        tree, answer = calibrate(problem, method, start=resting(problem), **options)
-        handed, found = take_up(problem, tree, answer), take_up(problem, tree)
-        pairs = (jax.tree.leaves((own.point, own.lins)) for own in (handed, found))
-        for one, other in zip(*pairs, strict=True):
-            np.testing.assert_allclose(one, other, atol=1e-6)
-        matrix = answer.prior.precision(problem.labels, problem.surveyed).matrix() if options else found.prior.matrix()
-        np.testing.assert_allclose(handed.prior.matrix(), matrix, rtol=1e-12)
-        assert float(handed.prior.log_determinant()) == pytest.approx(np.linalg.slogdet(np.asarray(matrix))[1])
-    tree, answer = calibrate(problem, EA(), start=resting(problem))
-    alone, handed = assess(problem, tree), assess(problem, tree, answer=answer)
-    assert alone["verdict"]["verdict"].values.tolist() == handed["verdict"]["verdict"].values.tolist()
-    assert fit(problem, EA(), start=resting(problem)).attrs[DECLARED] == tree.attrs[DECLARED]

@@ -189,18 +189,6 @@ def test_the_other_side_is_seen_where_places_are_integrated():
 
 
 @pytest.mark.slow
-def test_a_tree_with_integrated_places_is_judged_alike_with_and_without_its_answer():
-    network, motion, table = tags(0, [2, 3, 2, 3, 1, 2])
-    problem = pc.Problem(network, motion, table)
-    tree, answer = calibrate(problem, pc.MAP())
-    assert answer.problem.tilted
-    with_it, without = pc.assess(problem, tree, answer=answer), pc.assess(problem, tree)
-    for name in ("elpd", "rest_nis"):
-        near = with_it["target_check"][name].values
-        np.testing.assert_allclose(without["target_check"][name].values, near, atol=0.05)
-
-
-@pytest.mark.slow
 def test_a_tag_that_many_rows_place_to_a_hair_is_integrated_around_its_mode():
     """Heavy-tailed noise far from the place hides it: a search by slopes alone ended on its way there."""
 

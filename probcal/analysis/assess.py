@@ -33,7 +33,6 @@ from probcal.inference.widen import Rejection, rejection, unwidened, widened
 from probcal.labels import listed
 from probcal.linalg import invert
 from probcal.problem import Problem
-from probcal.results.answer import Answer
 from probcal.results.groups import bias_coords, node_of
 from probcal.results.read import each_target
 from probcal.simulate import Key, Truth, as_key
@@ -44,13 +43,10 @@ SHARED = 1.8  # sd that an open combination of one scale may put a bias off; of 
 
 
 @float64
-def assess(
-    problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, key: Key = 0, answer: Answer | None = None
-) -> xr.DataTree:
+def assess(problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, key: Key = 0) -> xr.DataTree:
     """Say what a fit is worth: a copy of its tree with further groups.
 
-    `problem` is the one that `fit` solved, `truth` is used for scoring only, `key` seeds replicas; the `answer` that
-    `calibrate` returns with the tree saves finding the point of the fit again.
+    `problem` is the one that `fit` solved, `truth` is used for scoring only, `key` seeds replicas.
 
     - `datum_check`, `epoch_check`, `channel_check`, `sensor_check`, `target_check`: innovations, and their NIS (mean
       square a datum) with limits; whiteness; posterior predictive p-values; PSIS-LOO by row; by sensor and target
@@ -77,7 +73,7 @@ def assess(
     'determined'
     """
     tree = unwidened(tree)  # what a fit made of its innovations is judged anew
-    fit = take_up(problem, tree, answer)
+    fit = take_up(problem, tree)
     with np.errstate(all="ignore" if _absurd(tree) else None):  # squares of absurd residuals overflow
         return _assessed(fit, tree, truth, as_key(key))
 

@@ -21,7 +21,7 @@ from probcal.cli.progress import shown
 from probcal.errors import InputError
 from probcal.files import Outputs
 from probcal.inference import METHODS, calibrate
-from probcal.inference.fit import linear_form
+from probcal.inference.fit import judged_problem
 from probcal.inference.manifest import remove_run
 from probcal.inference.progress import Monitor
 from probcal.inference.widen import judge_fit
@@ -108,16 +108,16 @@ def calibrated(
         problem, value, prior=chosen, key=seed, starts=starts, monitor=monitor, save=kept, store=store,
         resume=resume, overwrite=overwrite,
     )  # fmt: skip
-    if assessed and linear_form(answer) and not monitor.signal:
+    judged = judged_problem(problem, answer)
+    if assessed and judged is not None and not monitor.signal:
         from probcal.analysis import assess
 
         monitor.enter("checks")
         with _safe(tree, outputs, time.perf_counter() - began > LONG), monitor.leaving():
             near = truth if align is None else None  # of a truth in another frame no NEES
-            named = problem if problem.scans is None else answer.problem
-            tree = assess(named, tree, truth=near, key=seed, answer=answer)
-    elif linear_form(answer) and not monitor.signal:
-        tree = judge_fit(tree, answer)
+            tree = assess(judged, tree, truth=near, key=seed)
+    elif judged is not None and not monitor.signal:
+        tree = judge_fit(judged, tree)
     if monitor.signal:
         tree.attrs["interrupted"] = 1
         if assessed:

@@ -102,7 +102,8 @@ def fit(
         problem, method, prior=prior, key=key, start=start, starts=starts, monitor=Monitor(progress, limit), save=save,
         store=store, resume=resume, overwrite=overwrite,
     )  # fmt: skip
-    return judge_fit(found, answer) if linear_form(answer) else found
+    judged = judged_problem(problem, answer)
+    return found if judged is None else judge_fit(judged, found)
 
 
 @float64
@@ -111,7 +112,7 @@ def calibrate(
     start: Point | None = None, starts: int = 1, monitor: Monitor | None = None, save: Collection[str] = (),
     store: str | PathLike[str] | None = None, resume: bool = False, overwrite: bool = False,
 ) -> tuple[xr.DataTree, Answer]:  # fmt: skip
-    """The tree of `fit`, and the answer behind it, which `assess` takes so that it need not be found again."""
+    """The tree of `fit`, and the answer behind it, which the loops over many fits read."""
     method, monitor = EA() if method is None else method, monitor or Monitor()
     chosen = choose_prior(method, prior, problem.network.labels)
     check_problem(problem, linear=not method.by_particles)
@@ -179,6 +180,13 @@ def _directions(answer: Answer) -> tuple[tuple[Direction, ...], int]:
         return (), 0
     found = weak_directions(answer.problem, information, posterior.point)
     return found, len(found)
+
+
+def judged_problem(problem: Problem, answer: Answer) -> Problem | None:
+    """The problem by which the tree of an answer is judged, its rows named; None where no motion has a linear form."""
+    if not linear_form(answer):
+        return None
+    return problem if problem.scans is None else answer.problem
 
 
 def linear_form(answer: Answer) -> bool:

@@ -24,7 +24,7 @@ from probcal.model.rows import Linearised
 from probcal.modes.grid import follow_states, track_mode
 from probcal.priors import Precision
 from probcal.problem import Epochs, Problem
-from probcal.results.answer import Answer, blocks_under
+from probcal.results.answer import blocks_under
 from probcal.results.blocks import SensorBlocks
 from probcal.results.groups import datum_of, gather, weights_of_tails
 from probcal.results.read import each_track, saved_by_epoch
@@ -51,7 +51,6 @@ class Judged:
     spread: SensorBlocks  # of the covariance of z
     engine: Engine
     gamma: np.ndarray | None = None  # (M,) how well the data determine each bias; None where they did not see it
-    scaled: SensorBlocks | None = None  # covariance under a prior of the declared scales, where it is known
 
     @property
     def point(self) -> Point:
@@ -117,8 +116,8 @@ class Judged:
     def declared(self, tree: xr.DataTree) -> SensorBlocks | None:
         """Covariance of z by sensor that the declared scales leave; None where the information of all is held."""
         told = tree["calibration"].to_dataset()
-        if self.scaled is not None or self.whole:
-            return self.scaled
+        if self.whole:
+            return None
         if not self.engine.exact:
             apart = 1.0 - told["contraction"].values
             return SensorBlocks(len(apart), np.arange(len(apart))[:, None], apart[:, None, None])
@@ -133,45 +132,31 @@ class Judged:
         return found[:, :-1]
 
 
-def take_up(problem: Problem, fit: xr.DataTree, answer: Answer | None = None) -> Judged:
-    """The fit of a problem from its tree, and from the answer behind it where that is at hand.
+def take_up(problem: Problem, fit: xr.DataTree) -> Judged:
+    """The fit of a problem from its tree: in memory and from a file it is judged by the same numbers.
 
-    Biases, precisions and levels are those of the tree; without an answer the trajectories are brought to their mode
-    again and the problem is linearised anew. Raises `InputError` where the tree is no fit of this problem.
+    The trajectories are brought to their mode again from the saved ones, and the problem is linearised there. Raises
+    `InputError` where the tree is no fit of this problem.
     """
-    problem, datum, picks = identified(problem, fit, answer)
-    group = fit["calibration"].to_dataset()
-    spread = SensorBlocks.read(group, problem.labels, "assess", problem.scales)
-    asked = factoriser() if answer is None else getattr(answer.method, "engine", "auto")
-    asked = "iterative" if "sd_error" in group else asked
-    engine = engine_of(asked if "block" in group else "dense", problem.model)
-    if answer is not None:
-        at, scaled = answer.posterior.expansion, answer.posterior.declared
-    else:
-        point = point_of(problem, fit)
-        if fit.attrs.get("places") == "integrated":
-            problem = problem.with_tilt(tilt_at(problem.model, point))
-        at, scaled = engine.at(problem.model, point), None
-    return Judged(problem, at, picks, datum, _prior(group), spread, engine, group["gamma"].values, scaled)
-
-
-def identified(problem: Problem, fit: xr.DataTree, answer: Answer | None) -> tuple[Problem, pd.DataFrame, list[Any]]:
-    """The problem as it was fitted, and its data; raises `InputError` where the tree is no fit of this problem."""
     if "calibration" not in fit.children or "track" not in fit.children:
         raise InputError("assess: the tree is no fit; give the problem and the DataTree that fit() returned for it")
     group = fit["calibration"].to_dataset()
     if group["bias_label"].values.tolist() != list(problem.labels):
         raise InputError("assess: the tree was fitted with other free biases; give the problem as it was fitted")
-    if answer is not None:
-        problem = answer.problem
-    else:
-        problem = problem.unlinked() if fit.attrs.get("motion") == "left out" else problem
-        problem = problem.retimed(group["mean"].values / problem.scales)
-        problem = _weighted(problem, dict(each_track(fit)))
+    problem = problem.unlinked() if fit.attrs.get("motion") == "left out" else problem.untilted
+    problem = problem.retimed(group["mean"].values / problem.scales)
+    problem = _weighted(problem, dict(each_track(fit)))
     datum, picks = datum_of(problem)
     if not np.array_equal(datum["y"], fit["observed_data"].to_dataset()["y"].values):
         raise InputError("assess: the tree was fitted to other data; give the problem as it was fitted")
-    return problem, pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()}), picks
+    data = pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()})
+    spread = SensorBlocks.read(group, problem.labels, "assess", problem.scales)
+    asked = "dense" if "block" not in group else "iterative" if "sd_error" in group else factoriser()
+    engine, point = engine_of(asked, problem.model), point_of(problem, fit)
+    if fit.attrs.get("places") == "integrated":
+        problem = problem.with_tilt(tilt_at(problem.model, point))
+    at = engine.at(problem.model, point)
+    return Judged(problem, at, picks, data, _prior(group), spread, engine, group["gamma"].values)
 
 
 def _weighted(problem: Problem, tracked: dict[str, xr.Dataset]) -> Problem:
@@ -192,7 +177,8 @@ def point_of(problem: Problem, fit: xr.DataTree) -> Point:
     if problem.levels:
         level = fit["level"].to_dataset()
         point = at_levels(problem.model, point, jnp.asarray(level_logs(problem.levels, level["std"].values)))
-    z = jnp.asarray(fit["calibration"].to_dataset()["mean"].values / problem.scales)
+    group = fit["calibration"].to_dataset()
+    z = jnp.asarray(group["point" if "point" in group else "mean"].values / problem.scales)
     return track_mode(problem, point._replace(z=z))
 
 

@@ -26,7 +26,6 @@ from probcal.model.rows import Linearised
 from probcal.motion.base import level_name
 from probcal.priors import Precision
 from probcal.problem import Problem
-from probcal.results.answer import Answer
 from probcal.results.blocks import SensorBlocks
 from probcal.results.groups import by_target, datum_of
 from probcal.results.read import Calibrated
@@ -343,12 +342,12 @@ def sentence(text: str) -> str:
 
 
 @float64
-def judge_fit(tree: xr.DataTree, answer: Answer) -> xr.DataTree:
-    """A copy of the tree of a fit with what its innovations say in its message, its intervals
+def judge_fit(problem: Problem, tree: xr.DataTree) -> xr.DataTree:
+    """A copy of the tree of a fit of a problem with what its innovations say in its message, its intervals
     widened by that."""
     if tree.attrs["status"] in INVALID:
         return tree
-    fit = take_up(answer.problem, tree, answer)
+    fit = take_up(problem, tree)
     found = residuals.innovations(fit, residuals.measured_kurtosis(fit)).innovations
     return _judged(fit, found, tree, fit.root, unmoved(fit), UNASSESSED)
 

@@ -12,7 +12,7 @@ from probcal.errors import InputError
 from probcal.lazy import Later
 from probcal.particles.ensemble import filter_ensemble
 from probcal.particles.particles import Particles
-from probcal.particles.weighted import FILTERS, Paths, judge_tracks, log_likelihood_at, prepared
+from probcal.particles.weighted import FILTERS, Paths, log_likelihood_at, prepared, status_of_tracks
 from probcal.problem import Problem
 from probcal.results.groups import by_target
 from probcal.results.read import apply
@@ -66,7 +66,7 @@ def particle_filter(
     tree = xr.DataTree.from_dict(groups)
     likelihood, error = log_likelihood_at(paths, z, levels, keys[2], runs)
     point = paths.point(parts["smoothed"], z, levels)
-    status, message = judge_tracks(problem.seen(), point, parts["smoothed"])
+    status, message = status_of_tracks(problem.seen(), point, parts["smoothed"])
     tree.attrs |= {
         "log_likelihood": likelihood, "log_likelihood_se": error, "particles": repr(particles),
         "status": str(status), "message": message,

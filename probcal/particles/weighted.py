@@ -400,12 +400,12 @@ def track_by_particles(
     tracks = paths.over(drawn, levels, keys[3]).tracks
     seen = problem.seen()
     tree = build_tracks(seen, [Band(t.mean, t.sd, np.asarray(m.mean)) for t, m in zip(tracks, zero, strict=True)])
-    status, message = judge_tracks(seen, point, found)
+    status, message = status_of_tracks(seen, point, found)
     tree.attrs |= {"status": str(status), "message": message, "smoother": repr(how)}
     return tree
 
 
-def judge_tracks(problem: Problem, point: Point, found: Ensemble) -> tuple[Status, str]:
+def status_of_tracks(problem: Problem, point: Point, found: Ensemble) -> tuple[Status, str]:
     """Status of tracks by particles at known biases, and a sentence: whether they explain the rows, and are enough."""
     least = fewest(found)
     facts = {"lost": notable_scatter(problem, point), "alike": str(least) if least < FEW else "", "converged": True}

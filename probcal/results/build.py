@@ -125,6 +125,9 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
         "status": np.array(answer.bias_status, str), "pull": answer.posterior.pull,
         "kind": np.array([b.kind for b in problem.biases], str), **found.columns,
     }  # fmt: skip
+    at = np.asarray(answer.posterior.point.z)
+    if not np.allclose(at, found.mean, rtol=0.0, atol=1e-9, equal_nan=True):  # of chains on several sides
+        columns["point"] = at * scales
     known = answer.posterior.expansion.information() if found.information is None else found.information
     matrices = {} if known is None else {"information": known}  # too many biases for it else
     if answer.prior.correlation:
