@@ -15,7 +15,7 @@ from probcal.gaussian.information import growing_square, rejected, squares_of
 from probcal.gaussian.mode import Point
 from probcal.inference.integrate import Integrated, Integration
 from probcal.inference.method import Iterated, State
-from probcal.inference.mixture import MixturePosterior, NormalPosterior
+from probcal.inference.mixture import gaussian, mixture
 from probcal.labels import listed
 from probcal.misfit import MisfitData, misfit_text, rejection_text
 from probcal.modes import automatic_start
@@ -56,15 +56,12 @@ def conclude(
     ended early.
     """
     alpha, worth = np.asarray(state.alpha), float(state.found.evidence)
-    posterior: NormalPosterior
     if how is None or mixed is None:
         covariance, information = SensorBlocks.of(np.asarray(state.found.covariance)), state.found.information
-        posterior = NormalPosterior.on(
-            problem, prior, state.point, covariance, alpha, information=information, evidence=worth
-        )
+        posterior = gaussian(problem, prior, state.point, covariance, alpha, information=information, evidence=worth)
     else:
         alpha = np.asarray(prior.precision(problem.labels, problem.surveyed).alpha)
-        posterior = MixturePosterior.of(problem, prior, how.form, alpha, mixed, worth)
+        posterior = mixture(problem, prior, how.form, alpha, mixed, worth)
     answer = conclude_at(
         problem, method, prior, posterior, trace, square, iterations,
         converged=bool(state.done) and (mixed is None or bool(mixed.settled)), refused=bool(state.refused),

@@ -18,13 +18,13 @@ from probcal.gaussian.mode import Point
 from probcal.inference.ending import conclude_at, diverged, fallen
 from probcal.inference.integrate import by_propagation
 from probcal.inference.method import Context
-from probcal.inference.mixture import MixturePosterior, NormalPosterior
+from probcal.inference.mixture import gaussian, mixture
 from probcal.inference.placed import Reached, with_places
 from probcal.model.model import Model
 from probcal.modes.mirrors import CLIMB
 from probcal.priors import Flat, Gaussian, Precision, Prior
 from probcal.problem import Problem
-from probcal.results.answer import Answer, blocks_under, tracks_at
+from probcal.results.answer import Answer, Posterior, blocks_under, tracks_at
 from probcal.results.schema import ROPE
 
 
@@ -56,12 +56,11 @@ def climb_on(engine: Engine, method: Any, problem: Problem, prior: Prior, start:
             end, settled = with_places(climb, end, engine, lambda: context.monitor.stopped)
         problem, at, mode = end.problem, end.at, end.state
         worth = evidence(at, scales, factors)
-        posterior: NormalPosterior
         if how is None:
             posterior = _normal(problem, prior, at, first, worth)
         else:
             mixed, work = by_propagation(how.form, first, engine, at, context.key, told, marginal=marginal)
-            posterior = MixturePosterior.of(problem, prior, how.form, first.alpha, mixed, worth.value, work)
+            posterior = mixture(problem, prior, how.form, first.alpha, mixed, worth.value, work)
             settled = settled and bool(mixed.settled)
     except MemoryError:
         if not (engine.exact and method.engine == "auto" and isinstance(prior, (Gaussian, Flat))):
@@ -89,7 +88,7 @@ def _memory(engine: Engine, model: Model) -> FitError:
     return FitError(f"memory does not hold {size}, not even without a factor: take fewer sensors or a shorter time")
 
 
-def _normal(problem: Problem, prior: Prior, at: Expansion, first: Precision, worth: Estimate) -> NormalPosterior:
+def _normal(problem: Problem, prior: Prior, at: Expansion, first: Precision, worth: Estimate) -> Posterior:
     """The Gaussian at a mode under precisions `first`; `worth` is its log evidence."""
     factors = Factors.of(first)
     spread = at.spread(factors)
@@ -97,7 +96,7 @@ def _normal(problem: Problem, prior: Prior, at: Expansion, first: Precision, wor
     declared = blocks if prior.proper else blocks.under_scales()
     errors = {"sd_error": 0.5 * spread.error / spread.biases} if spread.error.any() else {}
     numbers = {"log_evidence_error": worth.error} if prior.proper and worth.error else {}
-    return NormalPosterior.on(
+    return gaussian(
         problem, prior, at.point, blocks, first.alpha, evidence=worth.value, columns=declared.contraction() | errors,
         at=at, factors=factors, moments=tracks_at(at.point, spread.states), declared=declared,
         attrs={"rope": ROPE} | numbers,

@@ -33,7 +33,7 @@ from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.method import Context
 from probcal.inference.noise_step import draw_noise, levels_alone, log_prior_levels
 from probcal.inference.posed import Form, Natural
-from probcal.inference.posterior import Chains, conclude_draws
+from probcal.inference.posterior import chains, conclude_draws
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
 from probcal.inference.split_hmc import Reference, SplitGaussian, placed, split_variables, variables_of
@@ -41,7 +41,7 @@ from probcal.model.model import Model
 from probcal.modes.mirrors import CLIMB
 from probcal.priors import Horseshoe, Precision, Prior
 from probcal.problem import Problem
-from probcal.results.answer import Answer, Tracks, blocks_under
+from probcal.results.answer import Answer, Posterior, Tracks, blocks_under
 from probcal.results.blocks import SensorBlocks
 
 PILOT = 40  # sweeps on the Gaussian alone, the last half of which tells where the reference is taken
@@ -125,7 +125,7 @@ class Gibbs(Sampler):
             natural = Natural(jnp.zeros((0, 0)), jnp.zeros(0), model.level_spread, first)
             seconds = time.perf_counter() - began
             run = SamplerRun(self, self, form, natural, None, drawn, seconds, stopped, "", (), thin)
-            return conclude_draws(problem, prior, run, partial(GibbsChains.drawn, runs=runs))
+            return conclude_draws(problem, prior, run, partial(gibbs_chains, runs=runs))
         except MemoryError:
             raise FitError(
                 f"the factor of {model.state_size} state entries and {model.biases} biases does not fit in"
@@ -313,34 +313,27 @@ class _Sweeps:
         return Draw(**fields | {"states": self._states(at), "stats": {"acceptance_rate": np.array(chain.rate)}})
 
 
-@dataclass(frozen=True, eq=False)
-class GibbsChains(Chains):
-    """The draws of the biases by `Gibbs`, and moments of the states."""
+def gibbs_chains(
+    problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray], runs: _Sweeps
+) -> Posterior:
+    """The posterior of a run of `Gibbs`: the draws of the biases, and moments of the states."""
+    z, model, M, state = run.z, problem.model, run.form.biases, runs.state
+    assert state is not None
+    which = 0 if int(state.thin) == run.thin else 1  # a longer run that was interrupted leaves the draws before it
+    count, total, square, told, spread = (np.asarray(getattr(state, name))[which] for name in SUMS)
+    blocks = SensorBlocks.drawn(z.reshape(-1, M), blocks_of(model), spread / count)
+    near = runs.mode.moved(z.mean((0, 1)) - np.asarray(runs.mode.point.z))
+    at = runs.engine.settled(runs.model, at_levels(runs.model, near, jnp.asarray(run.levels.mean((0, 1)))))
+    middle = np.asarray(state.reference)[: model.state_size] + total / count
+    sd = np.sqrt(np.maximum(square / count - (total / count) ** 2, 0.0))
+    moments = tuple(map(Tracks, split_variables(model, middle)[0], split_variables(model, sd)[0]))
 
-    @classmethod
-    def drawn(
-        cls, problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray], runs: _Sweeps
-    ) -> GibbsChains:
-        """The posterior of a run."""
-        z, model, M, state = run.z, problem.model, run.form.biases, runs.state
-        assert state is not None
-        which = 0 if int(state.thin) == run.thin else 1  # a longer run that was interrupted leaves the draws before it
-        count, total, square, told, spread = (np.asarray(getattr(state, name))[which] for name in SUMS)
-        blocks = SensorBlocks.drawn(z.reshape(-1, M), blocks_of(model), spread / count)
-        near = runs.mode.moved(z.mean((0, 1)) - np.asarray(runs.mode.point.z))
-        known = at_levels(runs.model, near, jnp.asarray(run.levels.mean((0, 1))))
-        at = runs.engine.settled(runs.model, known)
-        middle = np.asarray(state.reference)[: model.state_size] + total / count
-        sd = np.sqrt(np.maximum(square / count - (total / count) ** 2, 0.0))
-        moments = tuple(map(Tracks, split_variables(model, middle)[0], split_variables(model, sd)[0]))
-        return cls.of(
-            problem, prior, run, mixed, blocks, np.clip(told / count, 0.0, 1.0), at=at, moments=moments,
-            declared=blocks_under(at, Factors.alone(np.ones(M))),
-        )  # fmt: skip
-
-    def log_joint(self, point: Point, phi: Phi) -> float:
-        """Log density of data and all unknowns at a point, as it is kept of each draw."""
-        model = self.problem.model
-        known = log_prior_of(self.run.form, phi, self.run.posed.first, np.asarray(point.z))
+    def joint(point: Point, phi: Phi) -> float:
+        known = log_prior_of(run.form, phi, run.posed.first, np.asarray(point.z))
         levels = jnp.sum(log_prior_levels(model, point.levels))
         return known + float(mixed_density(model, point) + levels)
+
+    return chains(
+        problem, prior, run, mixed, blocks, np.clip(told / count, 0.0, 1.0), at.point, at=at, moments=moments,
+        declared=blocks_under(at, Factors.alone(np.ones(M))), joint=joint,
+    )  # fmt: skip

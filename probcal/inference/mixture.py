@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, ClassVar, Self
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +11,8 @@ import numpy as np
 
 from probcal.errors import InputError
 from probcal.gaussian.draws import draw, draw_biases, draws_a_chain
-from probcal.gaussian.engine import Factors
-from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import Point
-from probcal.inference.hierarchy import Hierarchy, drawn_precisions, held, inclusions
+from probcal.inference.hierarchy import drawn_precisions, held, inclusions
 from probcal.inference.integrate import Integrated
 from probcal.inference.posed import Form
 from probcal.inference.propagate import Propagation
@@ -27,7 +24,6 @@ from probcal.results.answer import (
     Posterior,
     Summary,
     few_draws,
-    log_prior_normal,
     precisions_of,
     tracks_at,
 )
@@ -35,178 +31,145 @@ from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import ROPE
 
 
-@dataclass(frozen=True, eq=False)
-class NormalPosterior(Posterior):
-    """A Gaussian of the biases around a point, noise levels held."""
+def gaussian(
+    problem: Problem,
+    prior: Prior,
+    point: Point,
+    covariance: SensorBlocks,
+    alpha: Any,
+    *,
+    information: Any = None,
+    evidence: float = np.nan,
+    columns: Any = None,
+    **known: Any,
+) -> Posterior:
+    """The Gaussian of the biases at a point, noise levels held, with the precisions alpha (M,) of the end.
 
-    # of the prior, where the expansion is at hand
-    factors: Factors | None = field(default=None, kw_only=True)
-    chained: ClassVar[bool] = False
-
-    @classmethod
-    def on(
-        cls,
-        problem: Problem,
-        prior: Prior,
-        point: Point,
-        covariance: SensorBlocks,
-        alpha: Any,
-        *,
-        information: Any = None,
-        evidence: float = np.nan,
-        columns: Any = None,
-        **known: Any,
-    ) -> Self:
-        """The Gaussian at a point, with the precisions alpha (M,) that a method ended with."""
-        summary = Summary.of(
-            "Laplace",
-            precisions_of(problem, prior),
-            np.asarray(point.z),
-            covariance,
-            alpha,
-            information=information,
-            levels=point.levels,
-            evidence=evidence if prior.proper else None,
-            columns=columns,
-        )
-        return cls(problem, prior, point, summary, **known)
-
-    def biases(self, key: jax.Array) -> np.ndarray:
-        """Independent draws (chain, draw, M), as many as their size and that of the data allow."""
-        M = len(self.summary.mean)
-        if self.summary.covariance.whole:
-            shape = (CHAINS, draws_a_chain(self.problem.model.size, CHAINS))
-            covariance = jnp.asarray(self.summary.covariance.matrix())
-            z = draw_biases(self.point, covariance, key, shape[0] * shape[1])
-        else:
-            assert self.factors is not None
-            shape = (CHAINS, few_draws(M))
-            drawn = self.expansion.deviations(self.factors, key, shape[0] * shape[1])
-            z = self.summary.mean + np.asarray(drawn.z)
-        return np.asarray(z).reshape(*shape, M)
-
-    def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
-        """Independent draws, as many as the size of the data lets be kept."""
-        keys = jax.random.split(key)
-        return self.along(self.biases(keys[0]), keys[1], keep)
-
-    def along(self, z: np.ndarray, key: jax.Array, keep: tuple[str, ...]) -> Draws:
-        """Draws of the biases z (chain, draw, M), with a trajectory each where all is held.
-
-        Raises `InputError` for draws of what would take too much room.
-        """
-        if not self.summary.covariance.whole:
-            if {"states", "replicas"} & set(keep):
-                raise InputError(
-                    "fit(save=...): a fit in sparse form keeps no draws of states or replicas;"
-                    ' leave save out, or give engine="dense"'
-                )
-            keep = ()
-        shape, M = z.shape[:2], z.shape[2]
-        drawn: Any = ((), (), ())
-        if keep:
-            drawn = draw(self.expansion, jnp.asarray(z.reshape(-1, M)), self.point.levels, key, keep)
-        states, likelihood, replicas = ([np.asarray(a).reshape(*shape, *a.shape[1:]) for a in part] for part in drawn)
-        levels = np.broadcast_to(self.summary.levels, (*shape, len(self.summary.levels)))
-        return Draws(z, levels, states, np.arange(shape[1]), likelihood, replicas)
+    `known` are further fields of the posterior.
+    """
+    summary = Summary.of(
+        "Laplace",
+        precisions_of(problem, prior),
+        np.asarray(point.z),
+        covariance,
+        alpha,
+        information=information,
+        levels=point.levels,
+        evidence=evidence if prior.proper else None,
+        columns=columns,
+    )
+    return Posterior(problem, prior, point, summary, known.pop("draw", draw_gaussian), **known)
 
 
-@dataclass(frozen=True, eq=False)
-class MixturePosterior(NormalPosterior):
-    """A mixture of Gaussians of the biases around a point, noise levels held."""
+def gaussian_biases(own: Posterior, key: jax.Array) -> np.ndarray:
+    """Independent draws (chain, draw, M), as many as their number and that of the data allow."""
+    M = len(own.summary.mean)
+    if own.summary.covariance.whole:
+        shape = (CHAINS, draws_a_chain(own.problem.model.size, CHAINS))
+        covariance = jnp.asarray(own.summary.covariance.matrix())
+        middle = own.point._replace(z=jnp.asarray(own.summary.mean))
+        z = draw_biases(middle, covariance, key, shape[0] * shape[1])
+    else:
+        assert own.factors is not None
+        shape = (CHAINS, few_draws(M))
+        drawn = own.expansion.deviations(own.factors, key, shape[0] * shape[1])
+        z = own.summary.mean + np.asarray(drawn.z)
+    return np.asarray(z).reshape(*shape, M)
 
-    z: np.ndarray  # (chain, draw, M)
-    hierarchy: Hierarchy
-    first: np.ndarray  # (M,) precisions before the hierarchy governs some
 
-    chained: ClassVar[bool] = True
+def draw_gaussian(own: Posterior, key: jax.Array, keep: tuple[str, ...]) -> Draws:
+    """Independent draws of a Gaussian, as many as the size of the data lets be kept."""
+    keys = jax.random.split(key)
+    return draw_along(own, keys[1], keep, gaussian_biases(own, keys[0]))
 
-    @classmethod
-    def of(
-        cls,
-        problem: Problem,
-        prior: Prior,
-        form: Form,
-        first: Any,
-        found: Integrated,
-        evidence: float,
-        work: Propagation | None = None,
-    ) -> MixturePosterior:
-        """The mixture of an integration.
 
-        `first` (M,) are the precisions of what no hierarchy governs, `evidence` is that under the
-        declared scales, `work` where a propagation ended that holds no covariance of all biases.
-        """
-        mean, spread, *others = found.moments
-        mean, lower, upper, gamma = map(np.asarray, (mean, *others))
-        held_whole = not isinstance(spread, SensorBlocks)
-        covariance = SensorBlocks.of(np.asarray(spread)) if held_whole else spread
-        known: dict[str, Any] = {}
-        if work is None:
-            columns = inclusions(form.hierarchy, np.asarray(found.z), found.phi)
-        else:
-            assert work.found is not None
-            assert work.begun is not None
-            factors, at = work.found.factors, work.likelihood.here
-            known = {
-                "at": at,
-                "factors": factors,
-                "moments": tracks_at(found.point, at.spread(factors).states),
-            }
-            known["declared"] = SensorBlocks(len(mean), work.members, work.begun.covariance)
-            columns = known["declared"].contraction()
-        summary = Summary.of(
-            "mixture",
-            "integrated",
-            mean,
-            covariance,
-            first,
-            gamma=gamma,
-            interval=(lower, upper),
-            governed=~held(prior, problem),
-            information=found.information,
-            levels=found.point.levels,
-            evidence=evidence,
-            columns=columns,
-        )
-        numbers = {"rope": ROPE}
-        if work is None:
-            for name in ("mean_error", "sd_error"):
-                numbers[name] = float(np.max(getattr(found, name), initial=0.0))
-        chains, count = found.z.shape[:2]  # fewer draws are kept where the data are many
-        most = min(count, draws_a_chain(problem.model.size, chains))
-        kept = np.linspace(0, count - 1, most).round().astype(int)
-        hyper = {name: np.asarray(values)[:, kept] for name, values in found.phi.items()}
-        z, variables = np.asarray(found.z)[:, kept], form.hierarchy.variables(problem.labels, hyper)
-        return cls(
-            problem,
-            prior,
-            found.point,
-            summary,
-            z,
-            form.hierarchy,
-            np.asarray(first),
-            hyper=hyper,
-            variables=variables,
-            attrs=numbers,
-            **known,
-        )
+def draw_along(own: Posterior, key: jax.Array, keep: tuple[str, ...], z: np.ndarray) -> Draws:
+    """Draws of the biases z (chain, draw, M), with a trajectory each where all is held.
 
-    @cached_property
-    def worth(self) -> float | None:
-        """Evidence at the mean with the precisions that the mixture ended with: declared scales would shun a swap."""
-        if self.declared is not None:
-            return super().worth
-        prior = self.prior.precision(self.problem.labels, self.problem.surveyed)
-        alpha = jnp.asarray(self.summary.precision)
-        with jax.enable_x64(True):
-            return float(laplace(self.problem.model, self.point, prior._replace(alpha=alpha)).evidence)
+    Raises `InputError` for draws of what would take too much memory.
+    """
+    if not own.summary.covariance.whole:
+        if {"states", "replicas"} & set(keep):
+            raise InputError(
+                "fit(save=...): a fit in sparse form keeps no draws of states or replicas;"
+                ' leave save out, or give engine="dense"'
+            )
+        keep = ()
+    shape, M = z.shape[:2], z.shape[2]
+    drawn: Any = ((), (), ())
+    if keep:
+        drawn = draw(own.expansion, jnp.asarray(z.reshape(-1, M)), own.point.levels, key, keep)
+    states, likelihood, replicas = ([np.asarray(a).reshape(*shape, *a.shape[1:]) for a in part] for part in drawn)
+    levels = np.broadcast_to(own.summary.levels, (*shape, len(own.summary.levels)))
+    return Draws(z, levels, states, np.arange(shape[1]), likelihood, replicas)
 
-    def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
-        """Draws of the mixture with a trajectory each, as many as the size of the data lets be kept."""
-        return self.along(self.z, key, keep)
 
-    def log_prior(self, draws: Draws) -> np.ndarray | None:
-        """Log density (chain, draw, M) of each bias given its precision, where every bias has one of its own."""
-        alpha = drawn_precisions(self.prior, self.hierarchy, self.hyper, self.first)
-        return None if alpha is None else log_prior_normal(draws.z, alpha)
+def mixture(
+    problem: Problem,
+    prior: Prior,
+    form: Form,
+    first: Any,
+    found: Integrated,
+    evidence: float,
+    work: Propagation | None = None,
+) -> Posterior:
+    """The mixture of Gaussians of an integration, noise levels held.
+
+    `first` (M,) are the precisions of what no hierarchy governs, `evidence` is that under the
+    declared scales, `work` where a propagation ended that holds no covariance of all biases.
+    """
+    mean, spread, *others = found.moments
+    mean, lower, upper, gamma = map(np.asarray, (mean, *others))
+    held_whole = not isinstance(spread, SensorBlocks)
+    covariance = SensorBlocks.of(np.asarray(spread)) if held_whole else spread
+    known: dict[str, Any] = {}
+    if work is None:
+        columns = inclusions(form.hierarchy, np.asarray(found.z), found.phi)
+    else:
+        assert work.found is not None
+        assert work.begun is not None
+        factors, at = work.found.factors, work.likelihood.here
+        known = {
+            "at": at,
+            "factors": factors,
+            "moments": tracks_at(found.point, at.spread(factors).states),
+        }
+        known["declared"] = SensorBlocks(len(mean), work.members, work.begun.covariance)
+        columns = known["declared"].contraction()
+    summary = Summary.of(
+        "mixture",
+        "integrated",
+        mean,
+        covariance,
+        first,
+        gamma=gamma,
+        interval=(lower, upper),
+        governed=~held(prior, problem),
+        information=found.information,
+        levels=found.point.levels,
+        evidence=evidence,
+        columns=columns,
+    )
+    numbers = {"rope": ROPE}
+    if work is None:
+        for name in ("mean_error", "sd_error"):
+            numbers[name] = float(np.max(getattr(found, name), initial=0.0))
+    chains, count = found.z.shape[:2]  # fewer draws are kept where the data are many
+    most = min(count, draws_a_chain(problem.model.size, chains))
+    kept = np.linspace(0, count - 1, most).round().astype(int)
+    hyper = {name: np.asarray(values)[:, kept] for name, values in found.phi.items()}
+    z, variables = np.asarray(found.z)[:, kept], form.hierarchy.variables(problem.labels, hyper)
+    return Posterior(
+        problem,
+        prior,
+        found.point,
+        summary,
+        partial(draw_along, z=z),
+        hyper=hyper,
+        hierarchy=form.hierarchy,
+        precisions=partial(drawn_precisions, prior, form.hierarchy, hyper, np.asarray(first)),
+        variables=variables,
+        attrs=numbers,
+        chained=True,
+        **known,
+    )

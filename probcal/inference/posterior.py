@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from probcal.modes.grid import track_mode
 from probcal.modes.mirrors import Mirrored
 from probcal.priors import Flat, Prior
 from probcal.problem import Problem
-from probcal.results.answer import Answer, Draws, Posterior, Summary, Tracks, log_prior_normal
+from probcal.results.answer import Answer, Draws, Posterior, Summary, Tracks
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL, ROPE
 from probcal.status import CHAINS, judge
@@ -35,68 +35,47 @@ K_HAT = 0.7
 BFMI = 0.3  # below which the energy is not explored (Betancourt 2016)
 
 
-@dataclass(frozen=True, eq=False)
-class Chains(Posterior):
-    """The draws of a sampler."""
+def chains(
+    problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray],
+    covariance: SensorBlocks | None = None, gamma: np.ndarray | None = None, point: Point | None = None, **known: Any,
+) -> Posterior:  # fmt: skip
+    """The posterior of a run, whose quantities mixed as they did.
 
-    run: SamplerRun
+    Covariance and gamma (M,) are those of the draws where they are not given, the point is that at their means.
+    `known` are further fields.
+    """
+    z, M, information, columns = run.z, run.form.biases, None, _columns(run, mixed, run.form.biases)
+    if covariance is None:
+        covariance = SensorBlocks.drawn(z.reshape(-1, M), np.arange(M)[None], np.asarray(run.draws.variance)[0, 0])
+        gamma, information = np.asarray(run.draws.gamma).mean((0, 1)), run.posed.information[:M, :M]
+    hyper, first = {name: np.asarray(a) for name, a in run.draws.phi.items()}, run.posed.first.alpha
+    if (declared := known.get("declared")) is not None:  # of some hyper-parameters no draws are kept
+        columns |= declared.contraction()
+        known["precisions"] = lambda: None
+    half = 50 * (1 - INTERVAL)
+    summary = Summary.of(
+        "exact" if run.method.exact else "variational", "sampled", z.mean((0, 1)), covariance, first, gamma=gamma,
+        interval=np.percentile(z, [half, 100 - half], axis=(0, 1)),
+        governed=np.isin(np.arange(M), run.form.hierarchy.learnt), information=information,
+        levels=run.levels.mean((0, 1)), columns=columns,
+    )  # fmt: skip
+    mine = z[run.side == heaviest(run)]
+    fields: dict[str, Any] = {
+        "hyper": hyper, "hierarchy": run.form.hierarchy, "variables": _variables(problem, run), "run": run,
+        "precisions": partial(drawn_precisions, prior, run.form.hierarchy, hyper, first),
+        "stats": {"lp": np.asarray(run.draws.density)} | _stats(run), "attrs": _numbers(run),
+        "moments": [Tracks(x.mean((0, 1)), x.std((0, 1))) for x in run.states],
+        "side": (mine.mean(0), mine.std(0) if len(mine) > 1 else summary.sd), "chained": True, "held": False,
+    } | known  # fmt: skip
+    return Posterior(problem, prior, mean_point(problem, run) if point is None else point, summary, draw_run, **fields)
 
-    held: ClassVar[bool] = False
 
-    @classmethod
-    def of(
-        cls, problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray],
-        covariance: SensorBlocks | None = None, gamma: np.ndarray | None = None, **known: Any,
-    ) -> Self:  # fmt: skip
-        """The posterior of a run, whose quantities mixed as they did.
-
-        Covariance and gamma (M,) are those of the draws where they are not given.
-        """
-        z, M, information, columns = run.z, run.form.biases, None, _columns(run, mixed, run.form.biases)
-        if covariance is None:
-            covariance = SensorBlocks.drawn(z.reshape(-1, M), np.arange(M)[None], np.asarray(run.draws.variance)[0, 0])
-            gamma, information = np.asarray(run.draws.gamma).mean((0, 1)), run.posed.information[:M, :M]
-        if (declared := known.get("declared")) is not None:
-            columns |= declared.contraction()
-        half = 50 * (1 - INTERVAL)
-        summary = Summary.of(
-            "exact" if run.method.exact else "variational", "sampled", z.mean((0, 1)), covariance,
-            run.posed.first.alpha, gamma=gamma, interval=np.percentile(z, [half, 100 - half], axis=(0, 1)),
-            governed=np.isin(np.arange(M), run.form.hierarchy.learnt), information=information,
-            levels=run.levels.mean((0, 1)), columns=columns,
-        )  # fmt: skip
-        point = cls.point_of(problem, run) if "at" not in known else known["at"].point
-        known.setdefault("moments", [Tracks(x.mean((0, 1)), x.std((0, 1))) for x in run.states])
-        return cls(
-            problem, prior, point, summary, run, hyper={k: np.asarray(a) for k, a in run.draws.phi.items()},
-            variables=_variables(problem, run), stats={"lp": np.asarray(run.draws.density)} | _stats(run),
-            attrs=_numbers(run), **known,
-        )  # fmt: skip
-
-    @classmethod
-    def point_of(cls, problem: Problem, run: SamplerRun) -> Point:
-        """Posterior means of biases and levels, and the trajectories there."""
-        return mean_point(problem, run)
-
-    @property
-    def here(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and sd (M,) of the biases on the heaviest side of a mirror."""
-        mine = self.run.z[self.run.side == heaviest(self.run)]
-        return mine.mean(0), mine.std(0) if len(mine) > 1 else self.summary.sd
-
-    def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
-        """The draws that were made; of data that are many, values by datum at some of them."""
-        keep = keep if self.run.states else ()
-        kept, likelihood, replicas = values_by_datum(self.problem, self.run, key, keep)
-        states = self.run.states if "states" in keep else []
-        return Draws(self.run.z, self.run.levels, states, kept, likelihood, replicas)
-
-    def log_prior(self, draws: Draws) -> np.ndarray | None:
-        """Log density (chain, draw, M) of each bias given its precision, where every bias has one of its own."""
-        if self.declared is not None:  # of some hyper-parameters no draws are kept
-            return None
-        alpha = drawn_precisions(self.prior, self.run.form.hierarchy, self.hyper, self.run.posed.first.alpha)
-        return None if alpha is None else log_prior_normal(self.run.z, alpha)
+def draw_run(own: Posterior, key: jax.Array, keep: tuple[str, ...]) -> Draws:
+    """The draws that were made; of data that are many, values by datum at some of them."""
+    keep = keep if own.run.states else ()
+    kept, likelihood, replicas = values_by_datum(own.problem, own.run, key, keep)
+    states = own.run.states if "states" in keep else []
+    return Draws(own.run.z, own.run.levels, states, kept, likelihood, replicas)
 
 
 def _numbers(run: SamplerRun) -> dict[str, float]:
@@ -111,7 +90,7 @@ def _numbers(run: SamplerRun) -> dict[str, float]:
 
 
 def conclude_draws(
-    problem: Problem, prior: Prior, run: SamplerRun, posterior_of: Callable[..., Chains] = Chains.of,
+    problem: Problem, prior: Prior, run: SamplerRun, posterior_of: Callable[..., Posterior] = chains,
     misfit: Callable[[Problem, Point], str] | None = None, **facts: Any,
 ) -> Answer:  # fmt: skip
     """The answer of a sampler's run; `misfit` says why its mean explains nothing, `facts` are further ones."""

@@ -11,8 +11,8 @@ import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from typing import Any, ClassVar, NamedTuple, Self
+from functools import partial
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ from probcal.inference.draws import slice_step
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.method import Context
 from probcal.inference.posed import Form, Natural, conditional, log_prior, prior_precision
-from probcal.inference.posterior import Chains, conclude_draws
+from probcal.inference.posterior import chains, conclude_draws
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
 from probcal.linalg import invert, without_negative
@@ -41,7 +41,7 @@ from probcal.particles.targets import Targets, place_by_epoch
 from probcal.particles.weighted import Paths, check_learnt, louis, prepared, unexplained
 from probcal.priors import Gaussian, Horseshoe, Prior
 from probcal.problem import Problem
-from probcal.results.answer import Answer
+from probcal.results.answer import Answer, Posterior
 
 SPREAD = 1.5  # by how much chains start further out than the data leave the biases
 SEARCH = 40  # iterations of the search for a start, where there is none
@@ -140,13 +140,12 @@ class ParticleGibbs(Sampler):
         held = Held(problem.model, targets, natural, group, reference, of_sensor)
         runs = _Gibbs(self, form, held, paths, z, levels, keys[1])
         drawn, thin, stopped = drawn_by(self, runs, 1, context.monitor, context.storage, context.threads)
-        run = ParticleRun(
-            self, self, form, natural, None, drawn, time.perf_counter() - began, stopped, "", (), thin, paths
-        )  # fmt: skip
+        run = SamplerRun(self, self, form, natural, None, drawn, time.perf_counter() - began, stopped, "", (), thin)
         linear = all(part is None for part in problem.model.sampled)
         share, solved = float(np.mean(drawn.stats["renewed"])), problem if linear else problem.seen()
         renewed = (share,) if share < STUCK else ()
-        return conclude_draws(solved, prior, run, ParticleChains.of, unexplained, renewed=renewed)
+        of_run = partial(particle_chains, paths=paths)
+        return conclude_draws(solved, prior, run, of_run, unexplained, renewed=renewed)
 
     def step(self, form: Form, posed: Any, chain: GibbsState) -> tuple[GibbsState, Sample]:
         """One sweep; `posed` is what is `Held`."""
@@ -352,54 +351,27 @@ class _Gibbs:
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
 
 
-@dataclass(frozen=True, eq=False)
-class ParticleRun(SamplerRun):
-    """What particle Gibbs leaves: its draws, and the particles that it was begun with."""
+def particle_chains(
+    problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray], paths: Paths
+) -> Posterior:
+    """The posterior of a run on `paths`, at states that stand for the particles at its means (Paper A 43).
 
-    paths: Any = None  # a `Paths`
-
-
-@dataclass(frozen=True, eq=False)
-class ParticleChains(Chains):
-    """The draws of particle Gibbs."""
-
-    @classmethod
-    def of(
-        cls, problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray], *known: Any, **more: Any
-    ) -> Self:
-        """The posterior of a run; where the precisions are known, the draws say what the data tell of the biases."""
-        found = super().of(problem, prior, run, mixed, *known, **more)
-        if run.form.hierarchy.learnt or run.z.shape[0] * run.z.shape[1] < MANY * run.form.biases:
-            return found
-        told = invert(found.summary.covariance.matrix()) - np.asarray(run.posed.first.matrix())
-        return replace(found, summary=replace(found.summary, information=without_negative(told)))
-
-    @classmethod
-    def point_of(cls, problem: Problem, run: SamplerRun) -> Point:
-        """Posterior means of biases and levels, and states that stand for the particles there (Paper A 43)."""
-        assert isinstance(run, ParticleRun)
-        paths, z, levels = run.paths, run.z.mean((0, 1)), run.levels.mean((0, 1))
-        found = paths.at(z, levels, jax.random.key(0))
-        point = paths.point(found, z, levels)
-        if any(form is not None for form in paths.problem.model.sampled):
-            return point
+    Where the precisions are known, the draws say what the data tell of the biases.
+    """
+    z, levels = run.z.mean((0, 1)), run.levels.mean((0, 1))
+    point = paths.point(paths.at(z, levels, jax.random.key(0)), z, levels)
+    if all(form is None for form in paths.problem.model.sampled):
         near = follow_states(problem, [np.asarray(x) for x in point.states])
-        return track_mode(problem, near._replace(z=jnp.asarray(z), levels=jnp.asarray(levels)))
-
-    @cached_property
-    def before(self) -> Point:
-        """The point with all biases zero: mean states by particles."""
-        assert isinstance(self.run, ParticleRun)
-        zero, levels = np.zeros_like(self.summary.mean), self.summary.levels
-        found = self.run.paths.at(zero, levels, jax.random.key(1))
-        point = self.run.paths.point(found, zero, levels)
-        return point._replace(states=tuple(m.mean for m in state_moments(self.run.paths.problem.model, found)))
-
-    @property
-    def pull(self) -> np.ndarray:
-        """Linear term (M,) of the log-likelihood of z about zero."""
-        assert isinstance(self.run, ParticleRun)
-        if self.run.form.hierarchy.learnt:
-            return np.asarray(self.run.posed.pull)[: self.run.form.biases]
-        mean = self.summary.mean  # of a Gaussian its slope vanishes there, the prior's included
-        return self.summary.information @ mean + np.asarray(self.run.posed.first.pull(jnp.asarray(mean)))
+        point = track_mode(problem, near._replace(z=jnp.asarray(z), levels=jnp.asarray(levels)))
+    without = paths.at(np.zeros_like(z), levels, jax.random.key(1))
+    zero = paths.point(without, np.zeros_like(z), levels)
+    zero = zero._replace(states=tuple(m.mean for m in state_moments(paths.problem.model, without)))
+    found = chains(problem, prior, run, mixed, point=point, zero=zero)
+    summary, first, learnt = found.summary, run.posed.first, run.form.hierarchy.learnt
+    if not learnt and run.z.shape[0] * run.z.shape[1] >= MANY * run.form.biases:
+        told = invert(summary.covariance.matrix()) - np.asarray(first.matrix())
+        summary = replace(summary, information=without_negative(told))
+    term = np.asarray(run.posed.pull)[: run.form.biases]
+    if not learnt:  # of a Gaussian its slope vanishes at the mean, the prior's included
+        term = np.asarray(summary.information) @ z + np.asarray(first.pull(jnp.asarray(z)))
+    return replace(found, summary=summary, term=term)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +13,12 @@ import numpy as np
 
 from probcal import linalg
 from probcal.errors import InputError
-from probcal.gaussian.draws import draw_biases, draws_a_chain, predictive
+from probcal.gaussian.draws import draw_biases, predictive
 from probcal.gaussian.information import rejected
 from probcal.gaussian.mode import Point
 from probcal.inference.ending import ABSURD, conclude_at
 from probcal.inference.method import Given
+from probcal.inference.mixture import gaussian_biases
 from probcal.labels import listed
 from probcal.linalg import cholesky, invert, orthogonalise, without_negative
 from probcal.misfit import rejection_text
@@ -146,55 +148,32 @@ class Paths:
         return Point(vectors, noises, jnp.asarray(z), jnp.asarray(levels))
 
 
-@dataclass(frozen=True, eq=False)
-class EnsemblePosterior(Posterior):
-    """A Gaussian of the biases, and the paths that particles draw given them."""
+def draw_paths(own: Posterior, key: jax.Array, keep: tuple[str, ...], paths: Paths, over: DrawnTracks) -> Draws:
+    """Independent draws of the biases; of some of them, or of all where states are kept, a path and its values."""
+    model, keys = own.problem.model, jax.random.split(key, 3)
+    z = np.array(gaussian_biases(own, keys[0]))
+    shape, M = z.shape[:2], z.shape[2]
+    count = shape[1] if "states" in keep else min(shape[1], SPREAD // CHAINS)
+    kept = np.unique(np.linspace(0, shape[1] - 1, count).round().astype(int))
+    levels = np.broadcast_to(own.summary.levels, (*shape, len(own.summary.levels)))
+    if not keep:
+        return Draws(z, levels, [], kept, [], [])
+    number = CHAINS * len(kept)
+    if number <= len(over.z):  # those that the tracks came from serve again
+        z[:, kept] = over.z[:number].reshape(CHAINS, len(kept), M)
+    else:
+        over = paths.over(z[:, kept].reshape(-1, M), own.summary.levels, keys[1])
+    states = [x[:number] for x in over.paths]
+    found = predictive(
+        model, jnp.asarray(levels[:, kept].reshape(number, -1)), jnp.asarray(over.z[:number]),
+        tuple(jnp.asarray(x) for x in states), keys[2], keep,
+    )  # fmt: skip
 
-    paths: Paths
-    term: np.ndarray  # (M,)
-    without: Point
-    over: DrawnTracks
+    def split(a: Any) -> np.ndarray:
+        return np.asarray(a).reshape(CHAINS, len(kept), *np.shape(a)[1:])
 
-    chained: ClassVar[bool] = False
-
-    def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
-        """Independent draws of the biases; of some of them, or of all where states are kept, a path and its values."""
-        M, model = self.problem.model.biases, self.problem.model
-        shape, keys = (CHAINS, draws_a_chain(model.size, CHAINS)), jax.random.split(key, 3)
-        covariance = jnp.asarray(self.summary.covariance.matrix())
-        z = np.array(draw_biases(self.point._replace(z=jnp.asarray(self.summary.mean)), covariance, keys[0],
-                                 shape[0] * shape[1])).reshape(*shape, M)  # fmt: skip
-        count = shape[1] if "states" in keep else min(shape[1], SPREAD // CHAINS)
-        kept = np.unique(np.linspace(0, shape[1] - 1, count).round().astype(int))
-        levels = np.broadcast_to(self.summary.levels, (*shape, len(self.summary.levels)))
-        if not keep:
-            return Draws(z, levels, [], kept, [], [])
-        number, over = CHAINS * len(kept), self.over
-        if number <= len(over.z):  # those that the tracks came from serve again
-            z[:, kept] = over.z[:number].reshape(CHAINS, len(kept), M)
-        else:
-            over = self.paths.over(z[:, kept].reshape(-1, M), self.summary.levels, keys[1])
-        states = [x[:number] for x in over.paths]
-        found = predictive(
-            model, jnp.asarray(levels[:, kept].reshape(number, -1)), jnp.asarray(over.z[:number]),
-            tuple(jnp.asarray(x) for x in states), keys[2], keep,
-        )  # fmt: skip
-
-        def split(a: Any) -> np.ndarray:
-            return np.asarray(a).reshape(CHAINS, len(kept), *np.shape(a)[1:])
-
-        likelihood, replicas = ([split(a) for a in part] for part in found)
-        return Draws(z, levels, [split(x) for x in states] if "states" in keep else [], kept, likelihood, replicas)
-
-    @property
-    def pull(self) -> np.ndarray:
-        """Linear term (M,) of the log-likelihood of z about zero."""
-        return self.term
-
-    @property
-    def before(self) -> Point:
-        """The point with all biases zero: mean states by particles."""
-        return self.without
+    likelihood, replicas = ([split(a) for a in part] for part in found)
+    return Draws(z, levels, [split(x) for x in states] if "states" in keep else [], kept, likelihood, replicas)
 
 
 class Louis(NamedTuple):
@@ -367,7 +346,7 @@ def steepness(slope: np.ndarray, covariance: np.ndarray, noise: np.ndarray) -> f
 
 def posterior_of(
     paths: Paths, prior: Prior, summary: Summary, told: Louis, key: jax.Array, numbers: Mapping[str, float]
-) -> EnsemblePosterior:  # fmt: skip
+) -> Posterior:  # fmt: skip
     """The posterior around a Gaussian of the biases, with tracks made by particles."""
     problem, keys = paths.problem, jax.random.split(key, 3)
     z, levels = jnp.asarray(summary.mean), summary.levels
@@ -385,7 +364,8 @@ def posterior_of(
         near = follow_states(problem, [np.asarray(x) for x in point.states])
         point = track_mode(problem, near._replace(z=z, levels=jnp.asarray(levels)))
     pull = summary.information @ np.asarray(z) + told.score
-    return EnsemblePosterior(seen, prior, point, summary, paths, pull, before, over, moments=over.tracks, attrs=numbers)
+    drawing = partial(draw_paths, paths=paths, over=over)
+    return Posterior(seen, prior, point, summary, drawing, moments=over.tracks, attrs=numbers, zero=before, term=pull)
 
 
 def track_by_particles(

@@ -1,13 +1,13 @@
 """The answer of any method: one type, which `fit`, `study`, `sbc` and the tree read.
 
-What differs between methods stands in its posterior: a Gaussian (`Normal`), or the draws of a sampler.
+What differs between methods stands in its posterior, plain data and a function that draws: `inference.mixture` makes
+that of a climb, `inference.posterior` that of a sampler.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
@@ -19,6 +19,7 @@ import numpy as np
 from probcal.gaussian.choose import engine_of
 from probcal.gaussian.engine import Expansion, Factors, Spread
 from probcal.gaussian.joint import blocks_of
+from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import Point
 from probcal.modes.grid import track_mode
 from probcal.modes.mirrors import Mirrored
@@ -133,30 +134,42 @@ class Summary:
 
 
 @dataclass(frozen=True, eq=False)
-class Posterior(ABC):
-    """What a method knows: a summary of the biases, and draws of everything."""
+class Posterior:
+    """What a method knows: a summary of the biases, and a function that draws everything."""
 
     problem: Problem
     prior: Prior
     point: Point  # the mode, or the mean with the trajectories at their mode
     summary: Summary
+    draw: Callable[[Posterior, jax.Array, tuple[str, ...]], Draws]  # of itself, with a key, what is kept
+    _: KW_ONLY
     # the posterior expanded at the point or near it; None: by the dense engine, when asked for
-    at: Expansion | None = field(default=None, kw_only=True)
+    at: Expansion | None = None
+    # of the prior, where that expansion is given
+    factors: Factors | None = None
     # the covariance that the declared scales leave, where that of all biases is not held
-    declared: SensorBlocks | None = field(default=None, kw_only=True)
+    declared: SensorBlocks | None = None
     # of the states of each recursion, where they are known
-    moments: Sequence[Tracks] | None = field(default=None, kw_only=True)
-    # (chain, draw, ...) hyper-parameters
-    hyper: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
+    moments: Sequence[Tracks] | None = None
+    # (chain, draw, ...) hyper-parameters, and the hierarchy that they belong to
+    hyper: Mapping[str, np.ndarray] = field(default_factory=dict)
+    hierarchy: Any = None
+    # precision of each bias by draw, where a hierarchy governs it
+    precisions: Callable[[], np.ndarray | None] | None = None
     # further variables by draw: dims beyond chain and draw, values, and their coordinates
-    variables: Mapping[str, Any] = field(default_factory=dict, kw_only=True)
+    variables: Mapping[str, Any] = field(default_factory=dict)
     # (chain, draw) of a sampler
-    stats: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
+    stats: Mapping[str, np.ndarray] = field(default_factory=dict)
     # numbers of the whole run
-    attrs: Mapping[str, float] = field(default_factory=dict, kw_only=True)
-
-    chained: ClassVar[bool] = True  # whether draws depend on each other
-    held: ClassVar[bool] = True  # whether noise levels are the same in every draw
+    attrs: Mapping[str, float] = field(default_factory=dict)
+    run: Any = None  # of a sampler
+    joint: Callable[[Point, Any], float] | None = None  # the log density that a sampler keeps of each draw
+    chained: bool = False  # whether draws depend on each other
+    held: bool = True  # whether noise levels are the same in every draw
+    # mean and sd (M,) on the heaviest side of a mirror, where draws lie on several
+    side: tuple[np.ndarray, np.ndarray] | None = None
+    zero: Point | None = None  # with all biases zero, where it is not the mode of the trajectories there
+    term: np.ndarray | None = None  # (M,) `pull`, where the expansion does not tell it
 
     @property
     def states(self) -> Sequence[np.ndarray]:
@@ -171,14 +184,15 @@ class Posterior(ABC):
             return self.moments
         return tracks_of(self.expansion, self.summary.covariance)
 
-    @abstractmethod
     def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
         """Draws; `keep` names "states", "log_likelihood" and "replicas"."""
+        return self.draw(self, key, keep)
 
     def log_prior(self, draws: Draws) -> np.ndarray | None:
         """Log density (chain, draw, M) of each bias given its precision; None for flat or correlated ones."""
         known = self.prior.proper and not self.prior.correlation and self.summary.covariance.whole
-        return log_prior_normal(draws.z, self.summary.precision) if known else None
+        alpha = self.precisions() if self.precisions is not None else self.summary.precision if known else None
+        return None if alpha is None else log_prior_normal(draws.z, alpha)
 
     @property
     def sound(self) -> bool:
@@ -189,17 +203,26 @@ class Posterior(ABC):
     @property
     def here(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean and sd (M,) of the biases on this side of a mirror, where there is one."""
-        return self.summary.mean, self.summary.sd
+        return (self.summary.mean, self.summary.sd) if self.side is None else self.side
 
-    @property
+    @cached_property
     def worth(self) -> float | None:
-        """What optima of several starts are ranked by: the evidence."""
-        return self.summary.evidence
+        """What optima of several starts are ranked by: the evidence.
+
+        That of a mixture is taken at the mean with the precisions that it ended with: declared scales would shun a
+        swap.
+        """
+        if self.summary.kind != "mixture" or self.declared is not None:
+            return self.summary.evidence
+        prior = self.prior.precision(self.problem.labels, self.problem.surveyed)
+        alpha = jnp.asarray(self.summary.precision)
+        with jax.enable_x64(True):
+            return float(laplace(self.problem.model, self.point, prior._replace(alpha=alpha)).evidence)
 
     @cached_property
     def before(self) -> Point:
         """The point with all biases zero, each trajectory at its mode."""
-        return track_mode(self.problem, uncalibrated(self.problem, self.point))
+        return self.zero or track_mode(self.problem, uncalibrated(self.problem, self.point))
 
     @property
     def pull(self) -> np.ndarray:
@@ -207,6 +230,8 @@ class Posterior(ABC):
 
         Its slope at the point is that of the marginal likelihood, the volume of the trajectories with it.
         """
+        if self.term is not None:
+            return self.term
         at, information = self.expansion, self.summary.information
         z = np.asarray(at.point.z)
         return np.asarray(at.apply(z) if information is None else information @ z) + np.asarray(at.score())

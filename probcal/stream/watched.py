@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import jax
@@ -10,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian.mode import Point
-from probcal.inference.mixture import NormalPosterior
+from probcal.inference.mixture import draw_along, gaussian, gaussian_biases
 from probcal.inference.widen import widened_by
 from probcal.linalg import invert, solve_square
 from probcal.modes import automatic_start
@@ -18,7 +17,7 @@ from probcal.modes.grid import track_mode
 from probcal.motion import Target
 from probcal.priors import Prior
 from probcal.problem import Problem
-from probcal.results.answer import Answer, Draws, Tracks
+from probcal.results.answer import Answer, Draws, Posterior, Tracks
 from probcal.results.blocks import SensorBlocks
 from probcal.results.build import build
 from probcal.status import Status
@@ -85,27 +84,9 @@ class Watched:
         return "Gaussian: rows linearised as they came, noise levels and precisions held"
 
 
-class StreamPosterior(NormalPosterior):
-    """A Gaussian of the biases by all rows of a stream; its problem has the last of them."""
-
-    @property
-    def pull(self) -> np.ndarray:
-        """Linear term (M,) of the log-likelihood of all rows about zero."""
-        return solve_square(self.summary.covariance.matrix(), self.summary.mean)
-
-
-@dataclass(frozen=True, eq=False)
-class FilteredPosterior(StreamPosterior):
-    """The same with the tracks that particles had of the last rows, whatever the motion."""
-
-    def draws(self, key: jax.Array, keep: tuple[str, ...]) -> Draws:
-        """Independent draws of the biases."""
-        return self.along(self.biases(key), key, ())
-
-    @property
-    def before(self) -> Point:
-        """The point with all biases zero, on the same tracks."""
-        return self.point._replace(z=jnp.zeros_like(self.point.z))
+def draw_filtered(own: Posterior, key: jax.Array, keep: tuple[str, ...]) -> Draws:
+    """Independent draws of the biases, without trajectories."""
+    return draw_along(own, key, (), gaussian_biases(own, key))
 
 
 @float64
@@ -127,11 +108,13 @@ def calibration_tree(online: FilteredStream) -> xr.DataTree:
         point = track_mode(problem, automatic_start(problem)._replace(z=jnp.asarray(z), levels=levels))
     covariance = root @ root.T
     before = np.asarray(online.prior.precision(problem.labels, problem.surveyed).matrix())
-    kind: Any = FilteredPosterior if sampled else StreamPosterior
-    posterior = kind.on(
+    known: dict[str, Any] = {}
+    if sampled:  # the tracks that particles had of the last rows, whatever the motion
+        known = {"moments": tracks, "zero": point._replace(z=jnp.zeros_like(point.z)), "draw": draw_filtered}
+    posterior = gaussian(
         problem, online.prior, point, SensorBlocks.of(covariance), np.diag(before),
         information=invert(covariance) - before, evidence=float(online.log_evidence),
-        moments=tracks if sampled else None,
+        term=solve_square(covariance, z), **known,
     )  # fmt: skip
     method = Watched(online.method)
     answer = Answer(

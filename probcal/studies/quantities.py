@@ -19,10 +19,7 @@ from probcal.errors import FitError
 from probcal.gaussian.frame import volume
 from probcal.gaussian.mode import Point, log_likelihood, mixed_density
 from probcal.inference.hierarchy import Hierarchy, Phi
-from probcal.inference.joint_gibbs import GibbsChains
-from probcal.inference.mixture import MixturePosterior
 from probcal.inference.posed import Form, Posed, log_prior
-from probcal.inference.posterior import Chains
 from probcal.inference.sampling import SamplerRun
 from probcal.lazy import Later
 from probcal.model.model import At, Model
@@ -88,17 +85,13 @@ def pool_of(answer: Answer, key: jax.Array, problem: Problem) -> Pool:
     points = Points(flat(drawn.z), flat(drawn.levels), states)
     hyper = {name: flat(a) for name, a in posterior.hyper.items()}
     taken = answer.method != answer.requested
-    run = posterior.run if isinstance(posterior, Chains | GibbsChains) else None
-    hierarchy = (
-        posterior.hierarchy if isinstance(posterior, MixturePosterior) else None if run is None else run.form.hierarchy
-    )
+    run, joint = posterior.run, posterior.joint
     status = TAKEN if taken else str(answer.status) if run is None else "sampled"
-    joint: Callable[[Point, Phi], float] | None = None
-    if isinstance(posterior, GibbsChains):
-        joint = posterior.log_joint
-    elif run is not None and isinstance(run.posed, Posed):
+    if joint is None and run is not None and isinstance(run.posed, Posed):
         joint = partial(_joint, run.form, run.posed)
-    return Pool(points, hyper, drawn.z.shape[0], posterior.chained, posterior.held, status, run, hierarchy, joint)
+    return Pool(
+        points, hyper, drawn.z.shape[0], posterior.chained, posterior.held, status, run, posterior.hierarchy, joint
+    )
 
 
 @jax.jit
