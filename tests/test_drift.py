@@ -32,7 +32,7 @@ from probcal import (
     sensor,
     simulate,
 )
-from probcal.inference.posterior import bias_status
+from probcal.inference.ending import bias_status
 from probcal.labels import label_parts
 from probcal.plots import plot_drift, plot_gamma
 from probcal.report import write_report
@@ -71,7 +71,7 @@ def test_steps_have_times_scales_and_labels():
         "c.position_x@0.25": ("scale", 3.0, 0.25),
     }  # fmt: skip
     assert dict(zip(problem.labels, problem.surveyed, strict=True))["b.position_x@1"]
-    ended = dict(zip(problem.labels, bias_status(problem, {}, len(problem.labels)), strict=True))
+    ended = dict(zip(problem.labels, bias_status(problem, {}), strict=True))
     assert [ended[label] for label in kinds] == ["estimated", "drift", "drift", "survey", "estimated"]
     assert Problem(network, motion, table, fix=["*@*"]).labels == tuple(n for n in problem.labels if "@" not in n)
     assert label_parts("c.position_x@0.25") == ("c", "position_x@0.25")

@@ -17,7 +17,7 @@ from probcal.gaussian.linearised import laplace, noise_variances, predicted_vari
 from probcal.gaussian.mode import Point, cost, factors, find_mode
 from probcal.gaussian.recursion import trajectory
 from probcal.gaussian.tails import Variances
-from probcal.inference.posterior import bias_status
+from probcal.inference.ending import bias_status
 from probcal.model.rows import noise_std
 from probcal.priors import Precision
 from probcal.sensors import doa
@@ -50,7 +50,7 @@ def test_a_bias_whose_chains_disagree_is_not_mixed():
     problem, _ = linear("plane")
     r_hat = np.ones(len(problem.labels))
     r_hat[1] = 1.06
-    found = bias_status(problem, {"r_hat": r_hat}, len(r_hat))
+    found = bias_status(problem, {"not mixed": r_hat > 1.05})
     assert found[1] == "not mixed"
     assert set(found[:1] + found[2:]) == {"estimated", "survey"}
 

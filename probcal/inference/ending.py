@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -132,20 +132,19 @@ def conclude_at(
     if "misfit" not in others:
         facts["misfit"] = misfit_sentence(problem, point, square)
     status, message = judge(CLIMB, facts)
-    ended = _bias_status(problem, summary, low, far)
+    pruned = (summary.gamma < 1e-2) & (summary.precisions == "maximised")
+    ended = bias_status(problem, {"at bound": low, "diverged": far, "pruned": pruned})
     message = " ".join(part for part in (message, method.remark(prior)) if part)
     return Answer(
         problem, method, method, prior, posterior, status, message, ended, iterations, trace, steps, interrupted=cut
     )
 
 
-def _bias_status(problem: Problem, summary: Summary, low: np.ndarray, far: np.ndarray) -> tuple[str, ...]:
-    """How each bias ended."""
-    pruned = (summary.gamma < 1e-2) & (summary.precisions == "maximised")
+def bias_status(problem: Problem, masks: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+    """The end of each bias, by masks (M,) of those that are "not mixed", "at bound", "diverged" and "pruned"."""
     kind = np.array([bias.kind for bias in problem.biases], str)
-    conditions = [kind == "survey", kind == "drift", low, far, pruned]
-    words = ["survey", "drift", "at bound", "diverged", "pruned"]
-    return tuple(np.select(conditions, words, "estimated").tolist())
+    cases = {"not mixed": kind == "", "survey": kind == "survey", "drift": kind == "drift", **masks}
+    return tuple(np.select(list(cases.values()), list(cases), "estimated").tolist())
 
 
 def low_and_far(prior: Prior, summary: Summary, surveyed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -39,7 +39,6 @@ from probcal.results.answer import Answer, tracks_of
 from probcal.results.build import add_mirrors, add_optima, bands, build, build_tracks
 from probcal.results.read import apply
 from probcal.simulate import Key, as_key
-from probcal.status import FOUND
 from probcal.types import float64
 from probcal.wings import of_wing
 
@@ -166,7 +165,7 @@ def _interrupted(answer: Answer, monitor: Monitor) -> Answer:
     if not monitor.signal:
         return answer
     unseen = "" if monitor.stopped in answer.message else monitor.stopped
-    return replace(answer.judged(FOUND, interrupted=True, unseen=unseen), interrupted=True)
+    return replace(answer.judged(interrupted=True, unseen=unseen), interrupted=True)
 
 
 def _directions(answer: Answer) -> tuple[tuple[Direction, ...], int]:
@@ -212,15 +211,15 @@ def _watched(answer: Answer) -> Answer:
         return answer
     found = answer
     for run in runs(problem, point, many=not answer.posterior.summary.covariance.whole):
-        found = found.judged(FOUND, **{"gauge" if run.gauge else "along": run})
+        found = found.judged(**{"gauge" if run.gauge else "along": run})
     for strained in strained_starts(problem, point) if answer.motion == "used" else ():
-        found = found.judged(FOUND, strained=strained)
+        found = found.judged(strained=strained)
     for other in answer.mirrors:
         near = "worse" if other.gain <= -SAME else "equal"
-        found = found.judged(FOUND, **{near: (abs(other.gain), _place(answer, other))})
+        found = found.judged(**{near: (abs(other.gain), _place(answer, other))})
     alike = {other.kind for other in answer.mirrors if other.gain > -SAME}
     side = "line" if problem.network.dimension == 2 else "plane"
-    return found.judged(FOUND, node=NODE in alike, side=side if alike - {NODE, START} else "")
+    return found.judged(node=NODE in alike, side=side if alike - {NODE, START} else "")
 
 
 def _place(answer: Answer, other: Mirrored) -> str:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -40,7 +42,7 @@ def gaussian(
     *,
     information: Any = None,
     evidence: float = np.nan,
-    columns: Any = None,
+    columns: Mapping[str, np.ndarray] = MappingProxyType({}),
     **known: Any,
 ) -> Posterior:
     """The Gaussian of the biases at a point, noise levels held, with the precisions alpha (M,) of the end.

@@ -13,7 +13,7 @@ import numpy as np
 from probcal.gaussian.draws import draws_a_chain, predictive
 from probcal.gaussian.information import at_levels, mean_square
 from probcal.gaussian.mode import Point
-from probcal.inference.ending import FAR, misfit_sentence
+from probcal.inference.ending import FAR, bias_status, misfit_sentence
 from probcal.inference.hierarchy import drawn_precisions, inclusions
 from probcal.inference.mixed import ESS, R_HAT, UNSURE, mixing, weights_of_sides, within_sides
 from probcal.inference.pose import pareto_khat
@@ -98,7 +98,7 @@ def conclude_draws(
     posterior = posterior_of(problem, prior, run, mixed)
     unexplained = (misfit or _misfit)(problem, posterior.point)
     status, message = judge(CHAINS, facts_of(problem, prior, run, mixed) | facts | {"misfit": unexplained})
-    ended = bias_status(problem, mixed, run.form.biases)
+    ended = bias_status(problem, {"not mixed": mixed["r_hat"][: run.form.biases] > 1.05} if "r_hat" in mixed else {})
     return Answer(
         problem, run.method, run.asked, prior, posterior, status, message, ended, run.z.shape[1],
         interrupted=bool(run.stopped), mirrors=_mirrors(run),
@@ -190,15 +190,8 @@ def _stats(run: SamplerRun) -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in run.draws.stats.items()}
 
 
-def bias_status(problem: Problem, mixed: Mapping[str, np.ndarray], M: int) -> tuple[str, ...]:
-    """Of each bias what it was learnt from, or that its draws have not mixed."""
-    lost = mixed["r_hat"][:M] > 1.05 if "r_hat" in mixed else np.zeros(M, bool)
-    words = {"survey": "survey", "drift": "drift", "scale": "estimated"}
-    return tuple("not mixed" if bad else words[b.kind] for b, bad in zip(problem.biases, lost, strict=True))
-
-
 def facts_of(problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """What a run says of its draws, in the names of `probcal.status.CHAINS`."""
+    """The facts that a run says of its draws, in the names of `probcal.status.CHAINS`."""
     draws, names = run.z.shape[1], [*problem.labels, *(level.label for level in problem.levels)]
     facts: dict[str, Any] = {"note": run.note} | mixed_of(names, mixed, run.z.shape[0])
     if run.stopped:

@@ -26,7 +26,6 @@ from probcal.modes.reflections import new, reach
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.status import FOUND
 
 ELSEWHERE = "found from another start"
 ROUNDS = 8  # answers in turn, each with the rows where the one before puts them
@@ -67,7 +66,7 @@ def solve(
             return answer
         problem, start = taken_there(problem, answer.posterior.point)
     moving = [problem.labels[m] for m in np.flatnonzero(away > STILL * summary.sd)]
-    return answer.judged(FOUND, clocks=listed(moving, 3))
+    return answer.judged(clocks=listed(moving, 3))
 
 
 def _solve(

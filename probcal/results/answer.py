@@ -26,7 +26,7 @@ from probcal.modes.mirrors import Mirrored
 from probcal.priors import PRECISION_BOUNDS, Prior
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL
-from probcal.status import Rule, Status, judge
+from probcal.status import FOUND, Status, judge
 
 if TYPE_CHECKING:
     from probcal.problem import Problem
@@ -77,9 +77,9 @@ class Summary:
     gamma: np.ndarray  # (M,)
     precision: np.ndarray  # (M,) of the prior
     levels: np.ndarray  # (H,) log factors of the unknown noise levels
-    information: np.ndarray | None  # (M, M) of the data, trajectories marginalised, if held
-    evidence: float | None  # where the method has one
-    columns: Mapping[str, np.ndarray]  # further ones by name, (M,)
+    information: np.ndarray | None = None  # (M, M) of the data, trajectories marginalised, if held
+    evidence: float | None = None  # where the method has one
+    columns: Mapping[str, np.ndarray] = field(default_factory=dict)  # further ones by name, (M,)
 
     @classmethod
     def of(
@@ -95,8 +95,7 @@ class Summary:
         governed: np.ndarray | None = None,
         levels: Any = (),
         information: Any = None,
-        evidence: float | None = None,
-        columns: Mapping[str, np.ndarray] | None = None,
+        **others: Any,
     ) -> Summary:
         """The summary of biases of these moments under precisions alpha (M,).
 
@@ -111,21 +110,8 @@ class Summary:
         lower, upper = (mean - half, mean + half) if interval is None else interval
         precision = alpha if governed is None else np.where(governed, own, alpha)
         information = None if information is None else np.asarray(information)
-        levels, columns = np.asarray(levels, float), columns or {}
-        return cls(
-            kind,
-            precisions,
-            mean,
-            covariance,
-            lower,
-            upper,
-            gamma,
-            precision,
-            levels,
-            information,
-            evidence,
-            columns,
-        )
+        levels = np.asarray(levels, float)
+        return cls(kind, precisions, mean, covariance, lower, upper, gamma, precision, levels, information, **others)
 
     @property
     def sd(self) -> np.ndarray:
@@ -135,7 +121,7 @@ class Summary:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """What a method knows: a summary of the biases, and a function that draws everything."""
+    """The knowledge of a method: a summary of the biases, and a function that draws everything."""
 
     problem: Problem
     prior: Prior
@@ -207,7 +193,7 @@ class Posterior:
 
     @cached_property
     def worth(self) -> float | None:
-        """What optima of several starts are ranked by: the evidence.
+        """The evidence, by which optima of several starts are ranked.
 
         That of a mixture is taken at the mean with the precisions that it ended with: declared scales would shun a
         swap.
@@ -303,9 +289,9 @@ class Answer:
         """The answer with a further sentence in its message, and other changes."""
         return replace(self, message=f"{self.message} {said}".strip(), **changes)
 
-    def judged(self, rules: Sequence[Rule], **facts: Any) -> Answer:
-        """The answer with the status and the sentences that follow from further facts."""
-        status, said = judge(rules, facts, self.status)
+    def judged(self, **facts: Any) -> Answer:
+        """The answer with the status and the sentences that follow from further facts, in the names of `FOUND`."""
+        status, said = judge(FOUND, facts, self.status)
         return self.noted(said, status=status)
 
     @property

@@ -379,7 +379,7 @@ def _calibration(problem: Problem, kept: AssociationDraw, mixed: dict[str, np.nd
 def _facts(
     problem: Problem, mixed: dict[str, np.ndarray], number: np.ndarray, chains: int, most: int
 ) -> dict[str, Any]:
-    """What hurts of the draws, in the names of `probcal.status.CHAINS`."""
+    """The facts that hurt of the draws, in the names of `probcal.status.CHAINS`."""
     names = [*problem.labels, "the number of objects", "the number of detections of objects", "the log density"]
     limits = np.where(np.arange(len(names)) < len(problem.labels), R_HAT, NUMBERS)
     full = float((number == most).mean())
