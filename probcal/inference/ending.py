@@ -104,7 +104,7 @@ def uncertain(labels: Sequence[str], mixed: Integrated) -> str:
 
 def conclude_at(
     problem: Problem, method: Iterated, prior: Prior, posterior: Posterior, trace: np.ndarray, square: float,
-    iterations: int, *, converged: bool, refused: bool, evidence: float, lost: float = 0.0, stopped: str = "",
+    iterations: int, *, converged: bool, evidence: float, lost: float = 0.0, stopped: str = "",
     steps: np.ndarray | None = None, **others: Any,
 ) -> Answer:  # fmt: skip
     """The answer of a climb that ended at a posterior: whether it converged, never left its start, lost evidence.
@@ -123,7 +123,7 @@ def conclude_at(
 
     facts = {
         "iterations": iterations, "limit": FAR, "far": named(far),
-        "singular": not (posterior.sound and np.isfinite(evidence)), "refused": refused, beyond: named(low),
+        "singular": not (posterior.sound and np.isfinite(evidence)), beyond: named(low),
         "fallen": 0.0 if cut or lost <= FALL else lost, "converged": converged,
         "cut": f"{stopped} after {iterations} iteration{'s' * (iterations > 1)}" if cut else "",
         "moved": f"the last moved the objective by {moved:.2g}" if asked and np.isfinite(moved) else "",

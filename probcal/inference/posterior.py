@@ -44,7 +44,9 @@ def chains(
     Covariance and gamma (M,) are those of the draws where they are not given, the point is that at their means.
     `known` are further fields.
     """
-    z, M, information, columns = run.z, run.form.biases, None, _columns(run, mixed, run.form.biases)
+    z, M, information = run.z, run.form.biases, None
+    columns = {name: values[:M] for name, values in mixed.items()} | {"contraction": 1.0 - z.var((0, 1))}
+    columns |= inclusions(run.form.hierarchy, z, run.draws.phi)
     if covariance is None:
         covariance = SensorBlocks.drawn(z.reshape(-1, M), np.arange(M)[None], np.asarray(run.draws.variance)[0, 0])
         gamma, information = np.asarray(run.draws.gamma).mean((0, 1)), run.posed.information[:M, :M]
@@ -165,13 +167,6 @@ def values_by_datum(
     return kept, likelihood, replicas
 
 
-def _columns(run: SamplerRun, mixed: Mapping[str, np.ndarray], M: int) -> dict[str, np.ndarray]:
-    """Columns by bias beyond the usual ones."""
-    found = {name: values[:M] for name, values in mixed.items()}
-    contraction = {"contraction": 1.0 - run.z.var((0, 1))}
-    return found | contraction | inclusions(run.form.hierarchy, run.z, run.draws.phi)
-
-
 def _variables(problem: Problem, run: SamplerRun) -> dict[str, Any]:
     """Further posterior variables, name -> (dims beyond chain and draw, values, coords)."""
     found: dict[str, Any] = {
@@ -207,9 +202,8 @@ def facts_of(problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str
     if not run.method.exact:
         khat = pareto_khat(_stats(run)["log_weight"].ravel())
         facts["fitting" if khat < K_HAT else "unfitting"] = khat, K_HAT
-    if isinstance(prior, Flat) and (np.abs(run.z.mean((0, 1))[~problem.surveyed]) > FAR).any():
-        facts["far"] = True
-    return facts
+    away = np.abs(run.z.mean((0, 1))[~problem.surveyed])
+    return facts | {"far": isinstance(prior, Flat) and (away > FAR).any()}
 
 
 def mixed_of(names: Sequence[str], mixed: Mapping[str, np.ndarray], chains: int, limit: Any = R_HAT) -> dict[str, Any]:
@@ -218,8 +212,8 @@ def mixed_of(names: Sequence[str], mixed: Mapping[str, np.ndarray], chains: int,
     if "r_hat" in mixed:
         above = mixed["r_hat"] - limit
         worst = int(above.argmax())
-        facts["r_hat"] = (names[worst], mixed["r_hat"][worst]) if above[worst] > 0 else ()
-    facts["few"] = (names[few], mixed["ess"][few]) if mixed["ess"][few] < ESS * chains else ()
+        facts["r_hat"] = above[worst] > 0 and (names[worst], mixed["r_hat"][worst])
+    facts["few"] = mixed["ess"][few] < ESS * chains and (names[few], mixed["ess"][few])
     return facts
 
 
@@ -231,15 +225,15 @@ def _steps(run: SamplerRun) -> dict[str, Any]:
         facts["or"] = ", or take collapsed" if run.asked is run.method else ""
     if "tree_depth" in found:
         share = float((found["tree_depth"] >= getattr(run.method, "depth", np.inf)).mean())
-        facts |= {"depth": share} if share > 0.05 else {}
+        facts["depth"] = share > 0.05 and share
     if "energy" in found and np.ptp(found["energy"], axis=1).min() > 0:
         bfmi = (np.diff(found["energy"], axis=1) ** 2).mean(1) / found["energy"].var(1)
-        facts |= {"bfmi": (bfmi.min(), BFMI)} if bfmi.min() < BFMI else {}
+        facts["bfmi"] = bfmi.min() < BFMI and (bfmi.min(), BFMI)
     rate = found["acceptance_rate"].mean(1) if "acceptance_rate" in found else np.ones(1)
     if "swung" in found:
         taken = found["swung"].mean(1).min()
-        facts["accepted"] = (rate.mean(),) if rate.mean() < RARE else ()
-        facts["hmc"] = (taken,) if taken < RARE else ()
+        facts["accepted"] = rate.mean() < RARE and (rate.mean(),)
+        facts["hmc"] = taken < RARE and (taken,)
     if run.method.refusal and rate.min() < RARE:
         facts["turns"] = rate.min(), run.method.refusal
     return facts

@@ -148,7 +148,7 @@ class Paths:
         return Point(vectors, noises, jnp.asarray(z), jnp.asarray(levels))
 
 
-def draw_paths(own: Posterior, key: jax.Array, keep: tuple[str, ...], paths: Paths, over: DrawnTracks) -> Draws:
+def draw_ensemble(own: Posterior, key: jax.Array, keep: tuple[str, ...], paths: Paths, over: DrawnTracks) -> Draws:
     """Independent draws of the biases; of some of them, or of all where states are kept, a path and its values."""
     model, keys = own.problem.model, jax.random.split(key, 3)
     z = np.array(gaussian_biases(own, keys[0]))
@@ -325,7 +325,7 @@ def conclude_particles(
     left, asked = notable_scatter(posterior.problem, posterior.point), method.tolerance == 0
     return conclude_at(
         posterior.problem, method, prior, posterior, ended.trace, np.nan, len(ended.trace), converged=ended.still,
-        refused=False, evidence=told.log_likelihood, stopped=ended.stopped, steps=ended.steps,
+        evidence=told.log_likelihood, stopped=ended.stopped, steps=ended.steps,
         misfit=unexplained(posterior.problem, posterior.point),
         left=0.0 if stopped else left, ahead=ahead if ahead > AHEAD and not stopped else 0.0,
         inexact=(worst, error, slope.filters) if error > SD_ERROR and not stopped else (),
@@ -364,7 +364,7 @@ def posterior_of(
         near = follow_states(problem, [np.asarray(x) for x in point.states])
         point = track_mode(problem, near._replace(z=z, levels=jnp.asarray(levels)))
     pull = summary.information @ np.asarray(z) + told.score
-    drawing = partial(draw_paths, paths=paths, over=over)
+    drawing = partial(draw_ensemble, paths=paths, over=over)
     return Posterior(seen, prior, point, summary, drawing, moments=over.tracks, attrs=numbers, zero=before, term=pull)
 
 
