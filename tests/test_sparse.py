@@ -728,6 +728,20 @@ def forced(request, monkeypatch):
     return request.param
 
 
+@pytest.mark.ci
+@pytest.mark.parametrize("library", LIBRARIES, indirect=True)
+def test_tracks_under_heavy_tails_are_those_of_the_dense_engine(library, monkeypatch):
+    """Latent scales that follow from a calibration, and the tracks, to 1e-3 of their sds."""
+    problem, fit = loud(), pc.fit(loud(), pc.MAP(engine="dense"), prior=pc.Gaussian())
+    wanted = pc.track(problem, fit)["track/t"].to_dataset()
+    for name in ("choose", "room"):
+        monkeypatch.setattr(f"probcal.gaussian.{name}.ROOM", 0)
+    found = pc.track(problem, fit)["track/t"].to_dataset()
+    np.testing.assert_allclose(found["weight_velocity"], wanted["weight_velocity"], rtol=1e-3)
+    np.testing.assert_allclose((found["mean"] - wanted["mean"]) / wanted["sd"], 0.0, atol=1e-3)
+    np.testing.assert_allclose(found["sd"], wanted["sd"], rtol=1e-3)
+
+
 FORCED = ("cholmod", *(pytest.param(name, marks=pytest.mark.ci) for name in ("superlu", "many", "iterative")))
 SHORT = {"fit", "next_anchors", "changes", "compare", *engines.NOT} - {"observability", "EA"}
 TIERS = dict.fromkeys(("EA", "Gibbs"), pytest.mark.slow) | dict.fromkeys(SHORT, ())

@@ -32,6 +32,7 @@ def inform(model: Model, rows: tuple[Linearised, ...], held: Eliminated, z: Any)
 
 @jax.jit
 def _inform(model: Model, rows: tuple[Linearised, ...], held: Eliminated, z: jax.Array) -> jax.Array:
-    states = follow_biases(model, rows, tuple(kept.gain for kept in held.parts), z)
-    found = model.onto_biases(rows, times_weights(model, rows, model.responses(rows, states, z)))
+    moved = follow_biases(model, rows, tuple(kept.gain for kept in held.parts), z)
+    along = model.responses(rows, [own.states for own in moved], z)
+    found = model.onto_biases(rows, times_weights(model, rows, along))
     return found if model.tilt is None else found + model.tilt.times(z)

@@ -57,11 +57,11 @@ def times_weights(model: Model, rows: Rows, columns: Data) -> Data:
     return tuple(lin.weight[:, :, None] * own for *_, lin, own in model.each_block(rows, columns))
 
 
-def follow_biases(model: Model, rows: Rows, gains: Gains, dz: jax.Array) -> tuple[jax.Array, ...]:
-    """Changes (E, n, K) of the states that follow the biases by dz (M, K), by columns of the rows: no
-    (E, n, M) is made."""
+def follow_biases(model: Model, rows: Rows, gains: Gains, dz: jax.Array) -> tuple[rec.Smoothed, ...]:
+    """Changes (E, n, K) of states and noises that follow the biases by dz (M, K), by columns of the
+    rows: no (E, n, M) is made."""
     pulls = model.onto_states(rows, times_weights(model, rows, model.by_bias(rows, -dz)))
-    return model.each(lambda part, gain, b: rec.smooth(part.F, gain, b).states, gains, pulls)
+    return model.each(lambda part, gain, b: rec.smooth(part.F, gain, b), gains, pulls)
 
 
 @jax.jit
@@ -84,7 +84,7 @@ def _held(
 def _followed(
     model: Model, rows: Rows, gains: Gains, held: tuple[jax.Array, ...], dz: jax.Array
 ) -> tuple[jax.Array, ...]:
-    return jax.tree.map(jnp.add, held, follow_biases(model, rows, gains, dz))
+    return jax.tree.map(lambda own, by: own + by.states, held, follow_biases(model, rows, gains, dz))
 
 
 @jax.jit

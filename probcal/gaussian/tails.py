@@ -1,23 +1,29 @@
 """Process noise that is not Gaussian: the weights of its scale mixture, by their expectation over the trajectories.
 
-u_k ~ N(0, I / w_k) with w_k drawn anew at every epoch. Given all w everything is Gaussian; given the trajectory each
-w_k has a posterior of its own. A climb alternates: w_k is the mean of its posterior at the expected square of u_k, its
-smoothed variance (biases and trajectory) included, which maximises a lower bound of the evidence (variational Bayes).
+u_k ~ N(0, I / w_k) with w_k drawn anew at every epoch. Given all w everything is Gaussian; given the
+trajectory each w_k has a posterior of its own. A climb alternates: w_k is the mean of its posterior
+at the expected square of u_k, its smoothed variance (biases and trajectory) included, which
+maximises a lower bound of the evidence (variational Bayes).
 Weights at the mode of u alone would prefer small noises, the error of the joint mode again.
+The bound counts u and w as independent: where data tell little of each u, an unknown level comes
+out too large, 19 % for StudentT(4) in 8 simulated tracks. `Gibbs` and `NUTS` have no such error.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian.dense import DenseEngine
-from probcal.gaussian.engine import Expansion, Factors
+from probcal.gaussian.engine import Engine, Expansion, Factors
+from probcal.gaussian.factor import COLUMNS
 from probcal.gaussian.information import update_levels
+from probcal.gaussian.jointly import follow_biases
 from probcal.gaussian.linearised import noise_variances, predicted_variances
-from probcal.gaussian.mode import Point, smooth_tracks
+from probcal.gaussian.mode import Point
 from probcal.model.model import Data, Mixing, Model, Recursion
+from probcal.model.rows import Linearised
 from probcal.problem import Problem
 
 ROUNDS, STILL = 50, 1e-3  # of precisions and trajectories in turn, and change of log precision at which they end
@@ -62,7 +68,7 @@ def expected_mixing(model: Model, point: Point, variances: tuple[jax.Array, ...]
 
 
 def rewhitened(model: Model, point: Point, weights: Mixing) -> Point:
-    """The same states at other precisions of the process noise than those of the model: its noises are rescaled."""
+    """The same states at other precisions of the process noise: the whitened noises are rescaled."""
     if not model.tailed:
         return point
     after = model.with_mixing(weights).recursions
@@ -70,11 +76,12 @@ def rewhitened(model: Model, point: Point, weights: Mixing) -> Point:
     return point._replace(noises=noises)
 
 
-def settle(problem: Problem, point: Point, covariance: jax.Array) -> tuple[Problem, Point]:
-    """Precisions and trajectories that agree, at held biases of a covariance (M, M): the problem, and the point."""
+def settle(engine: Engine, problem: Problem, point: Point, root: Any) -> tuple[Problem, Point]:
+    """Problem and point whose precisions and trajectories agree, at held biases of the covariance
+    root root', root (M, R)."""
     for _ in range(ROUNDS if problem.model.tailed else 0):
-        point = smooth_tracks(problem.model, point)
-        weights = _expected(problem.model, point, covariance)
+        at = engine.settled(problem.model, point)
+        point, weights = at.point, expected_mixing(problem.model, at.point, driven_by(at, root))
         pairs = zip(jax.tree.leaves(problem.model.mixing), jax.tree.leaves(weights), strict=True)
         moved = max(float(np.abs(np.log(np.asarray(b) / np.asarray(a))).max(initial=0.0)) for a, b in pairs)
         point, problem = rewhitened(problem.model, point, weights), problem.with_mixing(weights)
@@ -83,6 +90,19 @@ def settle(problem: Problem, point: Point, covariance: jax.Array) -> tuple[Probl
     return problem, point
 
 
+def driven_by(at: Expansion, root: Any) -> tuple[jax.Array, ...]:
+    """Variance (E, n) of every whitened noise, biases of the covariance root root', root (M, R)."""
+    gains = tuple(kept.gain for kept in at.eliminated.parts)
+    found = tuple(own.spread for own in at.given_biases())
+    for start in range(0, root.shape[1], COLUMNS):
+        own = root[:, start : start + COLUMNS]
+        found = _driven(at.model, at.rows, gains, found, own @ np.eye(own.shape[1]))
+    return found
+
+
 @jax.jit
-def _expected(model: Model, point: Point, covariance: jax.Array) -> Mixing:
-    return expected_mixing(model, point, Variances.dense(model, point, covariance).noises)
+def _driven(
+    model: Model, rows: tuple[Linearised, ...], gains: Any, found: tuple[jax.Array, ...], columns: Any
+) -> tuple[jax.Array, ...]:
+    moved = follow_biases(model, rows, gains, columns)
+    return jax.tree.map(lambda own, by: own + jnp.sum(by.noises**2, 2), found, moved)

@@ -293,9 +293,8 @@ def track(
     before, after = start._replace(z=jnp.asarray(problem.first_z)), start._replace(z=z)
     before = engine.settled(problem.model, before).point
     if problem.model.tailed:
-        covariance = jnp.asarray(found.covariance)
-        _, before = settle(problem, before, jnp.zeros_like(covariance))
-        problem, after = settle(problem, after, covariance)
+        _, before = settle(engine, problem, before, np.zeros((len(z), 0)))
+        problem, after = settle(engine, problem, after, found.spread.root())
     at = engine.settled(problem.model, after)
     tree = build_tracks(problem, bands(tracks_of(at, found.spread), before))
     return judge_tracks(tree, problem, found, engine, at)
