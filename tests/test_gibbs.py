@@ -139,7 +139,7 @@ def test_the_density_of_a_draw_is_the_joint_one_at_its_point(prior):
             at = variables_of([x[0, d] for x in run.states], run.z[0, d])
             point = placed(problem.model, start, jnp.asarray(at))
             phi = {name: jnp.asarray(leaf[0, d]) for name, leaf in posterior.hyper.items()}
-            assert posterior.log_joint(point, phi) == pytest.approx(run.draws.density[0, d], rel=1e-9)
+            assert posterior.joint(point, phi) == pytest.approx(run.draws.density[0, d], rel=1e-9)
 
 
 @pytest.mark.slow
