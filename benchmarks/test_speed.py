@@ -21,7 +21,6 @@ from probcal.analysis import next_passes, observability
 from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import Point, find_mode
 from probcal.inference.method import Context
-from probcal.inference.run import maximise
 from probcal.modes import automatic_start
 from probcal.modes.grid import project, track_mode
 from probcal.priors import Precision
@@ -117,7 +116,7 @@ def test_fifty_em_ea_iterations_of_c1(benchmark):
     with jax.enable_x64(True):
         start = automatic_start(problem)
         method, context = EMEA(iterations=50), Context(jax.random.key(0))
-        benchmark(lambda: jax.block_until_ready(maximise(method, problem, ARD(), start, context)[0].point.z))
+        benchmark(lambda: jax.block_until_ready(method.climb(problem, ARD(), start, context)[0].point.z))
 
 
 def test_one_smoothing_pass_of_c1(benchmark):

@@ -423,7 +423,7 @@ def test_memory_that_does_not_hold_a_factor_is_said(monkeypatch):
     def refused(*_):
         raise MemoryError
 
-    monkeypatch.setattr("probcal.inference.joint_gibbs.climb_with_noise", refused)
+    monkeypatch.setattr("probcal.inference.joint_gibbs.HostClimb.step", refused)
     with pytest.raises(pc.FitError, match="does not fit in memory: take fewer sensors or a shorter time"):
         pc.fit(drawn()[0], Gibbs(**SHORT))
 

@@ -16,7 +16,7 @@ from terminal import INSTALLED
 import probcal
 from probcal import analysis, inference, plots
 from probcal.cli.names import METHODS, PRIORS, SAVE
-from probcal.inference.fit import SAVE as SAVE_OF_FITS
+from probcal.inference.finish import SAVE as SAVE_OF_FITS
 from probcal.inference.sampler import Sampler
 from probcal.wings import installed
 
@@ -45,10 +45,6 @@ ERRORS = [  # of options and arguments, with the end of what is said
     ),
     ("fit {plaza} --chains 2", '--chains: "ea" draws no chains; take collapsed, nuts, gibbs or svi'),
     ("fit {plaza} --method nuts --resume", "--resume needs --out, the folder of the run to go on with"),
-    (
-        "fit {plaza} --out none --resume",
-        '--resume: "ea" keeps no draws to go on with; take collapsed, nuts, gibbs or svi',
-    ),
     ("fit {plaza} --overwrite", "--overwrite needs --out, the folder whose run it replaces"),
     ("fit {plaza} README.md CHANGELOG.md", "several recordings need --out, the folder for a fit of each and the table"),
     ("fit {plaza} README.md none.csv --out none", "none.csv: no such file"),

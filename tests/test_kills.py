@@ -47,6 +47,8 @@ def setting(run):
 KINDS = {  # command, its results, its parts while it runs, and groups that must not differ
     "collapsed": (("fit", "--method", "collapsed", "--chains", "2", "--draws"), "fit.nc", "draws/chunk-*.npz",
                   ("posterior", "sample_stats", "calibration")),
+    "ea-maximised": (("fit", "--method", "ea-maximised", "--starts"), "fit.nc", "draws/loop-*.npz",
+                     ("posterior", "optimum", "optimisation")),
     "nuts": (("fit", "--method", "nuts", "--chains", "2", "--warmup", "100", "--draws"), "fit.nc", "draws/chunk-*.npz",
              ("posterior", "sample_stats", "calibration")),
     "sbc": (("sbc", "--method", "map", "--posterior", "--runs"), "sbc.nc", "runs/runs-*.npz",
@@ -54,8 +56,8 @@ KINDS = {  # command, its results, its parts while it runs, and groups that must
     "study": (("study", "--methods", "ml,em", "--runs"), "study.nc", "runs/fits.zarr/status/c/*/*", ("",)),
 }  # fmt: skip
 OF_STUDIES = [pytest.param(kind, marks=pytest.mark.needs("studies")) for kind in ("sbc", "study")]
-SIZES = {"collapsed": 300, "nuts": 100, "sbc": 30, "study": 40}
-LONGER = {"collapsed": 3000, "nuts": 800, "sbc": 100, "study": 200}
+SIZES = {"collapsed": 300, "ea-maximised": 12, "nuts": 100, "sbc": 30, "study": 40}
+LONGER = {"collapsed": 3000, "ea-maximised": 60, "nuts": 800, "sbc": 100, "study": 200}
 
 
 @pytest.fixture(scope="module")
@@ -112,13 +114,13 @@ def check(kind, size, model, folder, kills):
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("kind", ["collapsed", OF_STUDIES[1]])  # ten kills of the others too, among the slow tests
+@pytest.mark.parametrize("kind", ["collapsed", "ea-maximised", OF_STUDIES[1]])  # ten kills among the slow tests
 def test_a_killed_command_is_resumed_with_the_same_results(kind, model, tmp_path):
     check(kind, SIZES[kind], model, tmp_path, 1)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["collapsed", "nuts", *OF_STUDIES])
+@pytest.mark.parametrize("kind", ["collapsed", "ea-maximised", "nuts", *OF_STUDIES])
 def test_ten_kills_change_nothing(kind, model, tmp_path):
     check(kind, LONGER[kind], model, tmp_path, 10)
 

@@ -23,7 +23,6 @@ from probcal.gaussian.mode import cost, find_mode
 from probcal.inference import METHODS, table
 from probcal.inference.method import Context
 from probcal.inference.methods import choose_prior
-from probcal.inference.run import maximise
 from probcal.inference.sampler import Sampler
 from probcal.model.model import At
 from probcal.noise import AdditiveNoise, Normal
@@ -228,7 +227,7 @@ def test_an_e_step_draws_by_its_key_and_keeps_its_carry():
 
         def end(step, seed):
             method = EM(step, iterations=40, tolerance=0.0)
-            return maximise(method, problem, Gaussian(), start, Context(jax.random.key(seed)))[0]
+            return method.climb(problem, Gaussian(), start, Context(jax.random.key(seed)))[0]
 
         exact, runs = end(Extended(), 0), [end(Drawn(400), seed) for seed in (0, 0, 1)]
         sd = np.sqrt(np.diagonal(exact.found.covariance))

@@ -40,6 +40,7 @@ from probcal import (
     simulate,
     track,
 )
+from probcal.inference.loop import Trace
 from probcal.inference.run import given_of
 from probcal.particles.em import wandering
 from probcal.particles.ensemble import ensemble, nearest_states
@@ -108,7 +109,8 @@ def ended_at(problem, away, how):
     method, prior = EM(how), Gaussian()
     with jax.enable_x64(True):
         given, levels = given_of(method, problem, prior), np.zeros(len(problem.levels))
-        ended = Ended(jnp.asarray(z), jnp.asarray(levels), given.prior.alpha, np.zeros(1), z[None], True, "")
+        trace = Trace(np.zeros(1), z[None], np.ones_like(z)[None])
+        ended = Ended(jnp.asarray(z), jnp.asarray(levels), given.prior.alpha, trace, True, "")
         targets, key = targets_of(problem.model), jax.random.key(2)
         told = louis(Paths(problem, how, targets), z, levels, key)
         return mean, covariance, z, told, conclude_particles(problem, method, how, prior, given, targets, ended, key)

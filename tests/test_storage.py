@@ -38,7 +38,6 @@ from probcal.cli.outputs import FIT, results_of_a_run
 from probcal.files import LOCK, NOTE, Lock, Outputs, make_folder, write_whole
 from probcal.geometry import norm
 from probcal.inference import identity
-from probcal.inference.fit import _check_store
 from probcal.inference.manifest import MANIFEST, remove_run, stored_run, write_manifest
 from probcal.inference.storage import Chunks, Records, Storage
 from probcal.results.io import SEAL, SMALL, _semi_definite, check_content
@@ -437,34 +436,6 @@ def fitted(method=METHOD, key=5, **options):
     return probcal.fit(p, method, prior=Gaussian(), start=resting(p), key=key, **options)
 
 
-@pytest.fixture(scope="module")
-def whole():
-    return fitted()
-
-
-@pytest.mark.ci
-def test_an_interrupted_fit_is_resumed_with_the_same_draws(tmp_path, whole):
-    def stop(at):
-        assert at.what == "Collapsed"
-        assert at.total == 250 or at.done == 0, "a phase begins"
-        if at.done >= 150:
-            raise KeyboardInterrupt
-
-    tree = fitted(progress=stop, store=tmp_path)
-    assert tree.attrs["status"] == "not converged"
-    assert "Interrupted after 100 of 200 draws" in tree.attrs["message"]
-    assert tree["posterior"].sizes["draw"] == 100
-    with pytest.raises(InputError, match=r"holds a sampler's run \(Collapsed.* already; give --resume"):
-        fitted(store=tmp_path)
-    with pytest.raises(InputError, match="the seed has changed"):
-        fitted(store=tmp_path, key=6, resume=True)
-    again = fitted(store=tmp_path, resume=True)
-    assert again.attrs["identity"] == tree.attrs["identity"]
-    for found in (again, fitted(store=tmp_path, resume=True)):  # the second reads a finished run back
-        assert np.array_equal(found["posterior"]["bias"], whole["posterior"]["bias"])
-        assert np.array_equal(found["sample_stats"]["lp"], whole["sample_stats"]["lp"])
-
-
 def test_ctrl_c_in_the_warm_up_leaves_nothing_to_report():
     def early(at):
         raise KeyboardInterrupt
@@ -473,13 +444,14 @@ def test_ctrl_c_in_the_warm_up_leaves_nothing_to_report():
         fitted(Collapsed(chains=2, warmup=100, draws=200, sweeps=1), progress=early)
 
 
-def test_a_method_without_draws_neither_resumes_nor_replaces(tmp_path):
+def test_a_climb_does_not_go_on_with_draws(tmp_path):
     chunks(tmp_path)
-    with pytest.raises(InputError, match="MAP has nothing to resume: samplers"):
-        fitted(MAP(), store=tmp_path, resume=True)
-    with pytest.raises(InputError, match=r"holds .* \(NUTS\(\)\): go on with it by its own method, give another f"):
+    with pytest.raises(InputError, match=r"holds a sampler's run \(NUTS\(\)\) already; give --resume"):
         fitted(MAP(), store=tmp_path)
-    assert _check_store(MAP(), tmp_path, resume=False, overwrite=True) is None, "it lets the draws lie"
+    with pytest.raises(InputError, match=r"holds a run of another kind \(draws\); give another folder, or give --over"):
+        fitted(MAP(), store=tmp_path, resume=True)
+    fitted(MAP(), store=tmp_path, overwrite=True)
+    assert stored_run(tmp_path).startswith("a climb (MAP(")
 
 
 @pytest.mark.ci

@@ -85,7 +85,7 @@ def fit_command(
         bool,
         typer.Option(
             "--resume",
-            help="go on with the stopped run of a sampler, or with the recordings, in --out",
+            help="go on with the stopped fit, or with the recordings, in --out",
         ),
     ] = False,
     overwrite: Overwrite = False,
@@ -123,8 +123,6 @@ def fit_command(
     if resume and out is None:
         raise InputError("--resume needs --out, the folder of the run to go on with")
     recordings = options.recordings(data or (), out, scheduler)
-    if not recordings:
-        options.check_resumed(method, resume)
     kept = options.saved_names(save)
     arguments = options.given(given or ())
     options.check_alignment(align)

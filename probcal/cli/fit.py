@@ -21,7 +21,7 @@ from probcal.cli.progress import shown
 from probcal.errors import InputError
 from probcal.files import Outputs
 from probcal.inference import METHODS, calibrate
-from probcal.inference.fit import judged_problem
+from probcal.inference.finish import judged_problem
 from probcal.inference.manifest import remove_run
 from probcal.inference.progress import Monitor
 from probcal.inference.widen import judge_fit

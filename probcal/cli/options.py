@@ -128,12 +128,6 @@ def saved_names(text: str) -> list[str]:
     return names
 
 
-def check_resumed(method: str, resume: bool) -> None:
-    """Raise `InputError` where a method that keeps no draws is to go on with a run."""
-    if resume and not METHODS[method].chains:
-        raise InputError(f'--resume: "{method}" keeps no draws to go on with; take collapsed, nuts, gibbs or svi')
-
-
 def parse_values(text: str) -> tuple[str, list[Any]]:
     """`name=a,b,c` or `name=first:last:step` as a name and its values; numbers where they are numbers."""
     name, equals, values = text.partition("=")

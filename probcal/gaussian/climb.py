@@ -8,20 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian.dense import DenseEngine
-from probcal.gaussian.engine import Engine, Expansion, Factors, evidence
+from probcal.gaussian.engine import Expansion, Factors
 from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
 from probcal.gaussian.marginal import volume_slope
 from probcal.gaussian.mode import SETTLED, TRACK_STEPS, Eliminated, Mode, Point, cost, find_tracks, follow
-from probcal.gaussian.search import climb_on_host, climb_traced
+from probcal.gaussian.search import Search, climb_on_host, climb_traced
 from probcal.gaussian.solves import Dense
-from probcal.gaussian.tails import Variances, renewed_noise
 from probcal.linalg import library
 from probcal.model.model import Model
 from probcal.priors import Precision
@@ -92,7 +91,7 @@ def find_marginal_mode(
     """
     if library(*jax.tree.leaves((model, start, prior, tolerance))) is np:
         expanded = _Expanded(partial(DenseEngine().settled, model), Factors.of(prior), True)
-        s, _ = climb_on_host(expanded, start, model.biases, iterations, tolerance)
+        s, *_ = climb_on_host(expanded, start, model.biases, iterations, tolerance)
         solved = s.at.eliminated
     else:
         s = climb_traced(_Traced(model, prior), start, model.biases, iterations, tolerance)
@@ -102,64 +101,38 @@ def find_marginal_mode(
 
 
 class Climbed(NamedTuple):
-    """The end of a climb: the posterior there, its negative log marginal density with the prior,
-    and how it went."""
+    """A climb that ended, or was stopped: the search, whose `at` is the posterior there, and its course."""
 
-    at: Expansion
-    value: float
-    trace: np.ndarray  # minus that after every step
-    converged: bool
-    refused: bool  # no step raised the density, though one promised to
+    search: Search
+    trace: np.ndarray  # (I,) log marginal density with the prior at the start and after every step
+    places: np.ndarray  # (I, M) biases there
+
+    @property
+    def at(self) -> Expansion:
+        """The posterior at the end."""
+        return cast("Expansion", self.search.at)
+
+    @property
+    def value(self) -> float:
+        """Negative log marginal density with the prior."""
+        return float(self.search.value)
+
+    @property
+    def converged(self) -> bool:
+        """Whether a step promised less than the tolerance."""
+        return bool(self.search.converged)
 
 
 def climb_to_mode(
     expand: Callable[[Point], Expansion], start: Point, factors: Factors, iterations: int, tolerance: float,
-    told: Callable[[int, float], bool] | None = None, *, marginal: bool = True,
+    told: Callable[[int, float], bool] | None = None, *, marginal: bool = True, search: Search | None = None,
 ) -> Climbed:  # fmt: skip
     """Climb to the mode of the marginal density times factors until a step promises less than
     tolerance.
 
     Without `marginal` it is the joint mode of biases and trajectory. `expand` gives the posterior
     at a point whose tracks it settles first. It ends where `told`, called with the number of steps
-    and the density, says so.
+    and the density, says so; a `search` that was stopped goes on.
     """
     expanded = _Expanded(expand, factors, marginal)
-    s, trace = climb_on_host(expanded, start, len(start.z), iterations, tolerance, told)
-    return Climbed(s.at, float(s.value), trace, bool(s.converged), len(trace) == 1 and not s.converged)
-
-
-def climb_with_noise(
-    engine: Engine,
-    model: Model,
-    start: Point,
-    prior: Precision,
-    factors: Factors,
-    steps: int,
-    turns: int,
-    tolerance: float,
-    told: Callable[[int, float], bool],
-    *,
-    marginal: bool = True,
-) -> Climbed:
-    """Climb in turn to the mode of the biases and, where noise is not known, to that of largest
-    evidence.
-
-    It ends where a turn moves the evidence by less than the tolerance; the trace is then the
-    evidence after each. `factors` are those of the prior.
-    """
-    point, trace = start, [-np.inf]
-    while True:
-        expand = partial(engine.settled, model)
-        mode = climb_to_mode(expand, point, factors, steps, 1e-2 * tolerance, told, marginal=marginal)
-        if not model.learns_noise:
-            return mode
-        trace.append(evidence(mode.at, prior, factors).value)
-        still = abs(trace[-1] - trace[-2]) < tolerance
-        ended = told(len(trace) - 1, trace[-1]) or len(trace) > turns
-        if still or ended or not np.isfinite(trace[-1]):
-            return mode._replace(
-                trace=np.array(trace[1:]),
-                converged=mode.converged and still,
-                refused=mode.refused and len(trace) == 2,
-            )
-        model, point = renewed_noise(model, mode.at.point, Variances.of(mode.at, factors))
+    return Climbed(*climb_on_host(expanded, start, len(start.z), iterations, tolerance, told, search))

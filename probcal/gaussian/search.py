@@ -84,25 +84,27 @@ def search_step(objective: Objective, s: Search, at: Any, tolerance: Any) -> Sea
 
 def climb_on_host(
     objective: Objective, start: Any, biases: int, iterations: int, tolerance: float,
-    told: Callable[[int, float], bool] | None = None,
-) -> tuple[Search, np.ndarray]:  # fmt: skip
+    told: Callable[[int, float], bool] | None = None, search: Search | None = None,
+) -> tuple[Search, np.ndarray, np.ndarray]:  # fmt: skip
     """Search from a start until a step promises less than the tolerance.
 
-    Returns the search and the log density after every step. It ends too where `told`, called with
-    the number of steps and the log density, says so.
+    Returns the search, and log density and biases at the start and after every step. It ends too
+    where `told`, called with the number of steps and the log density, says so; the `search` that
+    was stopped goes on from there.
     """
-    at, trace = objective.expand(start), list[float]()
-    s = Search.begin(at, biases)
+    s = Search.begin(None, biases) if search is None else search
+    trace, places = list[float](), list[np.ndarray]()
     while True:
-        s = search_step(objective, s, at, tolerance)
-        if s.taken > len(trace):
+        at = objective.expand(objective.moved(s.at, s.share * s.step) if s.taken else start)
+        before, s = s.taken, search_step(objective, s._replace(at=s.at if s.taken else at), at, tolerance)
+        if s.taken > before:
             trace.append(-float(s.value))
-            if told is not None and len(trace) > 1 and told(len(trace) - 1, trace[-1]):
+            places.append(np.asarray(s.at.point.z))
+            if told is not None and s.taken > 1 and told(int(s.taken) - 1, trace[-1]):
                 break
         if s.done or s.count > iterations:
             break
-        at = objective.expand(objective.moved(s.at, s.share * s.step))
-    return s, np.array(trace)
+    return s, np.array(trace), np.array(places).reshape(-1, biases)
 
 
 def climb_traced(objective: Objective, start: Any, biases: int, iterations: int, tolerance: Any) -> Search:

@@ -19,11 +19,12 @@ from probcal.gaussian.mode import Eliminated, Mode, Point, cost, eliminate, find
 from probcal.inference.ending import astray
 from probcal.inference.hierarchy import held, hierarchy_of
 from probcal.inference.integrate import Integration, likelihood
+from probcal.inference.loop import Trace
 from probcal.inference.method import Context, Given, State
 from probcal.inference.posed import Form
 from probcal.inference.pruned import without_far_modes
 from probcal.inference.relevance import best_precisions
-from probcal.inference.run import Maximiser, first_precision, given_of, learn, maximise, renew_noise, valued
+from probcal.inference.run import Maximiser, course_of, first_precision, given_of, learn, renew_noise, valued
 from probcal.model.model import Mixing, Model
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem
@@ -171,10 +172,12 @@ class EA(Maximiser):
         """Any hierarchical prior where precisions are integrated, else ARD."""
         return prior.hierarchical if self.precisions == "integrated" else isinstance(prior, ARD)
 
-    def climb(self, problem: Problem, prior: Prior, start: Point, context: Context) -> tuple[State, np.ndarray]:
+    def climb(
+        self, problem: Problem, prior: Prior, start: Point, context: Context, alpha: np.ndarray | None = None
+    ) -> tuple[State, Trace]:
         """The outer loop; where precisions are maximised, again without biases that another mode keeps in."""
-        state, trace = maximise(self, problem, prior, start, context)
-        if self.trajectory != "marginal" or not isinstance(prior, ARD) or self.integrates(prior):
+        state, trace = super().climb(problem, prior, start, context, alpha)
+        if alpha is not None or self.trajectory != "marginal" or not isinstance(prior, ARD) or self.integrates(prior):
             return state, trace
         if (prior.shape, prior.rate, prior.by) == (1.0, 0.0, None):
             state, trace = self._climbed_again(problem, prior, state, trace, context)
@@ -182,10 +185,11 @@ class EA(Maximiser):
             return state, trace
 
         def climb(point: Point, alpha: np.ndarray, mixing: Mixing) -> State:
-            return maximise(self, problem.with_mixing(mixing), prior, point, context, alpha)[0]
+            return self.climb(problem.with_mixing(mixing), prior, point, context, alpha)[0]
 
         kept = without_far_modes(problem.model, prior, given_of(self, problem, prior), state, climb)
-        return kept, trace if kept is state else np.append(trace, float(kept.objective))
+        last = jax.tree.map(lambda leaf: np.asarray(leaf)[None], course_of(kept))
+        return kept, trace if kept is state else trace.and_then(last)
 
     def climbs_once(self, problem: Problem, prior: Prior) -> bool:
         """Not where maximised precisions are tried anew after a climb."""
@@ -193,17 +197,17 @@ class EA(Maximiser):
         return super().climbs_once(problem, prior) and not again
 
     def _climbed_again(
-        self, problem: Problem, prior: Prior, state: State, trace: np.ndarray, context: Context
-    ) -> tuple[State, np.ndarray]:
+        self, problem: Problem, prior: Prior, state: State, trace: Trace, context: Context
+    ) -> tuple[State, Trace]:
         """The state after climbs from better precisions, while there are any."""
         for _ in range(BETTER):
             alpha, gain = self._better(problem, prior, state)
             if gain <= GAIN or not np.isfinite(float(state.objective)):
                 break
-            tried, more = maximise(self, problem.with_mixing(state.mixing), prior, state.point, context, alpha)
+            tried, more = self.climb(problem.with_mixing(state.mixing), prior, state.point, context, alpha)
             if not float(tried.objective) > float(state.objective) + self.tolerance:
                 break
-            state, trace = tried, np.concatenate([trace, more])
+            state, trace = tried, trace.and_then(more)
         return state, trace
 
     def _better(self, problem: Problem, prior: Prior, state: State) -> tuple[np.ndarray, float]:

@@ -105,7 +105,7 @@ def uncertain(labels: Sequence[str], mixed: Integrated) -> str:
 def conclude_at(
     problem: Problem, method: Iterated, prior: Prior, posterior: Posterior, trace: np.ndarray, square: float,
     iterations: int, *, converged: bool, evidence: float, lost: float = 0.0, stopped: str = "",
-    steps: np.ndarray | None = None, **others: Any,
+    **others: Any,
 ) -> Answer:  # fmt: skip
     """The answer of a climb that ended at a posterior: whether it converged, never left its start, lost evidence.
 
@@ -135,9 +135,7 @@ def conclude_at(
     pruned = (summary.gamma < 1e-2) & (summary.precisions == "maximised")
     ended = bias_status(problem, {"at bound": low, "diverged": far, "pruned": pruned})
     message = " ".join(part for part in (message, method.remark(prior)) if part)
-    return Answer(
-        problem, method, method, prior, posterior, status, message, ended, iterations, trace, steps, interrupted=cut
-    )
+    return Answer(problem, method, method, prior, posterior, status, message, ended, iterations, trace, interrupted=cut)
 
 
 def bias_status(problem: Problem, masks: Mapping[str, np.ndarray]) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from importlib.metadata import version
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -14,11 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.fingerprint import ADDRESS, computes
+from probcal.inference.storage import Storage
 from probcal.model.rows import Block, Rows, information, log_likelihood, weigh
 from probcal.model.sampled import SampledMotion
 from probcal.motion import Component, Motion
 from probcal.network import Network, Node
 from probcal.noise import Heard, at_guess, guess_of
+from probcal.priors import Prior
 from probcal.problem import Problem
 from probcal.results.schema import RESULTS_VERSION
 from probcal.sensor import Channel, Sensor, SensorType
@@ -36,6 +39,20 @@ def identity_of(problem: Problem, **settings: Any) -> dict[str, str]:
     return identity(**settings) | {
         "data": data_digest(problem), "list of biases": labels, "model": model_digest(problem),
     }  # fmt: skip
+
+
+def stored_fit(
+    store: str | PathLike[str] | None, problem: Problem, method: Any, prior: Prior, key: jax.Array, start: Any,
+    starts: int, *, resume: bool, overwrite: bool,
+) -> Storage:  # fmt: skip
+    """The storage of a fit, in memory where no folder is given: of a sampler's draws, or of the states of climbs."""
+    known: dict[str, str] = {}
+    if store is not None:
+        known = identity_of(
+            problem, method=method, prior=prior, seed=seed_text(key), number_of_starts=starts,
+            start="" if start is None else points_digest(start),
+        )  # fmt: skip
+    return Storage(store, "climb" if method.climbs else "draws", known, resume=resume, overwrite=overwrite)
 
 
 def identity(**settings: Any) -> dict[str, str]:

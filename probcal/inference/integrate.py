@@ -5,7 +5,7 @@ marginal density. Gibbs sweeps over hyper-parameters and biases sample what a hi
 then moves to the mean of the mixture, once, and the sweeps go on. Noise levels are held.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -24,6 +24,7 @@ from probcal.gaussian.marginal import volume_slope
 from probcal.gaussian.mode import Eliminated, Point, smooth_tracks
 from probcal.inference.gibbs import gibbs_sweep
 from probcal.inference.hierarchy import Phi
+from probcal.inference.method import Context
 from probcal.inference.posed import Form, Natural, activity, draw_given, prior_precision
 from probcal.inference.propagate import BiasLikelihood, Propagation
 from probcal.model.model import Model
@@ -89,7 +90,7 @@ def integrate(
     """
     if not how.sweeps:
         engine = engine_of("dense", model)
-        return by_propagation(how.form, first, engine, engine.at(model, start), key, marginal=how.marginal)[0]
+        return by_propagation(how.form, first, engine, engine.at(model, start), Context(key), marginal=how.marginal)[0]
     known, _ = likelihood(how, model, first, start)
     chains, point = begin(how.form, known, jax.random.fold_in(key, 0)), start
     for turn in range(MOVES if search else 1):
@@ -138,8 +139,7 @@ def by_propagation(
     first: Precision,
     engine: Engine,
     at: Expansion,
-    key: jax.Array,
-    told: Callable[[int, float], bool] | None = None,
+    context: Context,
     *,
     marginal: bool = True,
 ) -> tuple[Integrated, Propagation]:
@@ -150,8 +150,8 @@ def by_propagation(
     """
     first = form.rest(first)
     known = BiasLikelihood.of(engine, at, Factors.of(first), marginal=marginal)
-    work = Propagation.of(form, first, known, blocks_of(at.model), key)
-    work.run(told)
+    work = Propagation.of(form, first, known, blocks_of(at.model), context.key)
+    work.resume(context.run(work)[0])
     swept, here = work.swept, work.likelihood.here
     assert swept is not None
     z, covariance = joint_draws(work)
@@ -166,20 +166,19 @@ def joint_draws(work: Propagation) -> tuple[np.ndarray, SensorBlocks]:
 
     They are ordered as those of the Gaussian of likelihood and sites are (Iman and Conover 1982).
     """
-    swept, found, here = work.swept, work.found, work.likelihood.here
+    swept, factors, here = work.swept, work.factors, work.likelihood.here
     assert swept is not None
-    assert found is not None
     M, whole = work.form.biases, work.likelihood.whole
     shape = (CHAINS, KEPT if whole else few_draws(M))
     count, rng = shape[0] * shape[1], np.random.default_rng(np.asarray(jax.random.key_data(work.key)))
-    ordered = np.asarray(here.deviations(found.factors, work.key, count).z)
+    ordered = np.asarray(here.deviations(factors, work.key, count).z)
     pick = rng.integers(len(swept.means), size=(count, M))
     centre, spread = (np.take_along_axis(np.asarray(part), pick, 0) for part in (swept.means, swept.sds))
     alone = np.sort(centre + spread * rng.standard_normal((count, M)), 0)
     z = np.take_along_axis(alone, np.argsort(np.argsort(ordered, 0), 0), 0).reshape(*shape, M)
     if not whole:
         return z, SensorBlocks(M, work.members, swept.covariance)
-    own = SensorBlocks.of(np.asarray(here.marginals(found.factors, np.arange(M)[None]))[0])
+    own = SensorBlocks.of(np.asarray(here.marginals(factors, np.arange(M)[None]))[0])
     return z, own.widened(np.sqrt(work.variance / own.variance))
 
 

@@ -21,13 +21,13 @@ import numpy as np
 
 from probcal.errors import FitError, InputError
 from probcal.gaussian.choose import choose_fast
-from probcal.gaussian.climb import climb_with_noise
 from probcal.gaussian.engine import Engine, Expansion, Factors
 from probcal.gaussian.information import at_levels
 from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.mode import Point, mixed_density
 from probcal.inference.chains import Draw
 from probcal.inference.ending import diverged
+from probcal.inference.engined import HostClimb
 from probcal.inference.gibbs import draw_hyper, log_prior_of, precisions
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.method import Context
@@ -119,7 +119,8 @@ class Gibbs(Sampler):
         first = prior.precision(problem.labels, problem.surveyed)
         factors = Factors.alone(np.ones(model.biases)) if form.hierarchy.learnt else Factors.of(first)
         try:
-            mode = climb_with_noise(engine, model, start, first, factors, CLIMB, CLIMB, 1e-3, lambda *_: False).at
+            climb = HostClimb.of(self.name, CLIMB, 1e-3, engine, model, start, first, factors)
+            mode = climb.at(Context(context.key).run(climb)[0])
             runs = _Sweeps(self, form, first, engine, mode, context.key)
             drawn, thin, stopped = drawn_by(self, runs, 1, context.monitor, context.storage, context.threads)
             natural = Natural(jnp.zeros((0, 0)), jnp.zeros(0), model.level_spread, first)

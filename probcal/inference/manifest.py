@@ -16,7 +16,7 @@ from probcal.errors import InputError
 from probcal.files import Lock, cannot_write, write_whole
 
 MANIFEST = "probcal-run.json"
-KINDS = {"draws": "chunk", "sbc": "runs"}  # what a folder holds: the name of its numbered parts
+KINDS = {"draws": "chunk", "climb": "loop", "sbc": "runs"}  # what a folder holds: the name of its numbered parts
 STORE = "fits.zarr"  # the part of a study
 MARK = "probcal"  # attribute of a store that is complete: the digest of its run
 OLDER = re.compile(r"state\.npz|chunk-\d+\.nc|batch-\d+\.npz|runs\.json")  # of probcal before the manifest
@@ -108,8 +108,13 @@ def read_manifest(path: Path) -> tuple[str, dict[str, str]]:
 def described(path: Path) -> str:
     """What runs in a folder, for a sentence."""
     kind, identity = read_manifest(path)
-    words = {"draws": "a sampler's run", "sbc": "the runs of an sbc", "study": "the fits of a study"}.get(kind, kind)
-    return f"{words} ({identity['method']})" if "method" in identity else words
+    words = {
+        "draws": "a sampler's run",
+        "climb": "a climb",
+        "sbc": "the runs of an sbc",
+        "study": "the fits of a study",
+    }
+    return f"{words.get(kind, kind)} ({identity['method']})" if "method" in identity else words.get(kind, kind)
 
 
 def clear_parts(path: Path) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from probcal.errors import InputError
 from probcal.gaussian.linearised import LaplaceApproximation
 from probcal.gaussian.mode import Point
+from probcal.inference.loop import Task, Trace, run
 from probcal.inference.progress import Monitor
 from probcal.inference.storage import Storage
 from probcal.model.model import Mixing
@@ -53,9 +54,13 @@ class Context(NamedTuple):
 
     key: jax.Array
     monitor: Monitor = Monitor()  # what says how far it is, and when to stop: this one never does
-    storage: Storage | None = None  # where a sampler keeps its draws
+    storage: Storage | None = None  # where a sampler keeps its draws, and a climb its states
     threads: int | None = None
     fallback: Any = None  # the sampler that takes over where a collapse does not fit
+
+    def run(self, task: Task) -> tuple[Any, Trace]:
+        """The last state of a task and its course."""
+        return run(task, self.monitor, self.storage)
 
 
 class Method(ABC):

@@ -128,15 +128,13 @@ def mixture(
     if work is None:
         columns = inclusions(form.hierarchy, np.asarray(found.z), found.phi)
     else:
-        assert work.found is not None
-        assert work.begun is not None
-        factors, at = work.found.factors, work.likelihood.here
+        factors, at = work.factors, work.likelihood.here
         known = {
             "at": at,
             "factors": factors,
             "moments": tracks_at(found.point, at.spread(factors).states),
         }
-        known["declared"] = SensorBlocks(len(mean), work.members, work.begun.covariance)
+        known["declared"] = SensorBlocks(len(mean), work.members, work.begun)
         columns = known["declared"].contraction()
     summary = Summary.of(
         "mixture",

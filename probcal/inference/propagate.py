@@ -8,7 +8,6 @@ Gibbs sweeps within the blocks. Any engine gives the marginals of blocks.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -22,6 +21,7 @@ from probcal import linalg
 from probcal.gaussian.engine import Engine, Expansion, Factors, Group
 from probcal.gaussian.mode import Point
 from probcal.inference.hierarchy import Phi
+from probcal.inference.loop import Pause, Task, Trace
 from probcal.inference.posed import Form
 from probcal.linalg import invert, without_negative
 from probcal.priors import Precision
@@ -63,14 +63,13 @@ class BlockMarginals(NamedTuple):
 
     mean: np.ndarray  # (M,)
     covariance: np.ndarray  # (B, p, p) of each block; 1 on the diagonal where a block has fewer
-    factors: Factors  # the prior of what no hierarchy governs, and the sites
 
 
 @dataclass(frozen=True, eq=False)
 class BiasLikelihood:
     """The Gaussian likelihood of the biases at a point, by what any engine gives."""
 
-    expand: Callable[[Point], Expansion]
+    engine: Engine
     here: Expansion
     prior: Factors  # of the biases that no hierarchy governs
     whole: bool  # whether the covariance of all biases is made
@@ -79,7 +78,7 @@ class BiasLikelihood:
     @classmethod
     def of(cls, engine: Engine, at: Expansion, prior: Factors, *, marginal: bool = True) -> BiasLikelihood:
         """The likelihood at an expansion by an engine, and the prior of the biases that no hierarchy governs."""
-        return cls(partial(engine.settled, at.model), at, prior, engine.cheap, marginal)
+        return cls(engine, at, prior, engine.cheap, marginal)
 
     @property
     def z(self) -> np.ndarray:
@@ -88,12 +87,20 @@ class BiasLikelihood:
 
     def marginals(self, members: np.ndarray, sites: Blocks) -> BlockMarginals:
         """Marginals of blocks of members (B, p); raises `numpy.linalg.LinAlgError` where there are none."""
-        factors, here = self.prior + Factors((Group(members, sites.precision, sites.pull),)), self.here
+        factors, here = self.with_sites(members, sites), self.here
         if not np.isfinite(here.log_det(factors).value):
             raise np.linalg.LinAlgError("the precision of the biases is not positive definite")
         score = np.asarray(here.score() if self.marginal else here.slope()) + factors.pull(self.z)
         covariance = np.asarray(here.marginals(factors, members))
-        return BlockMarginals(self.z + np.asarray(here.solve(factors, score)), covariance, factors)
+        return BlockMarginals(self.z + np.asarray(here.solve(factors, score)), covariance)
+
+    def with_sites(self, members: np.ndarray, sites: Blocks) -> Factors:
+        """The prior of what no hierarchy governs, and the sites of blocks of members (B, p)."""
+        return self.prior + Factors((Group(members, sites.precision, sites.pull),))
+
+    def expand(self, point: Point) -> Expansion:
+        """The posterior with every track at its mode for the biases of a point."""
+        return self.engine.settled(self.here.model, point)
 
     def at(self, z: np.ndarray) -> BiasLikelihood:
         """The likelihood at other biases (M,), every track at its mode; as it is where there is none there."""
@@ -190,8 +197,20 @@ def sweep_blocks(
     return chain, BlocksSwept(mean, covariance + SPIKE * eye, gamma / count, means, sds)
 
 
+class PropagationState(NamedTuple):
+    """The state of a propagation between two rounds; arrays are empty before the first."""
+
+    point: Point  # of the likelihood
+    sites: Blocks
+    before: Blocks
+    chain: BlockChain
+    swept: BlocksSwept
+    begun: Any  # (B, p, p)
+    settled: Any
+
+
 @dataclass(eq=False)
-class Propagation:
+class Propagation(Task):
     """Where a propagation stands: the likelihood, the sites in the place of the priors, and what both say."""
 
     form: Form
@@ -200,17 +219,26 @@ class Propagation:
     members: np.ndarray  # (B, p) biases of each block, M of none
     key: jax.Array
     sites: Blocks
-    chain: BlockChain | None = None
-    swept: BlocksSwept | None = None
-    found: BlockMarginals | None = None
-    begun: BlockMarginals | None = None  # that of the first round, under the declared scales
+    before: Blocks  # those of the last marginals
+    chain: BlockChain
+    swept: BlocksSwept
+    begun: Any  # (B, p, p) covariances of the first round, under the declared scales
     settled: bool = False  # whether the means came to rest
 
     @classmethod
     def of(cls, form: Form, first: Precision, likelihood: BiasLikelihood, members: np.ndarray, key: jax.Array) -> Any:
         """The beginning: biases of their declared scales."""
         precision = np.eye(members.shape[1])[None] * np.isin(members, form.hierarchy.learnt)[:, :, None]
-        return cls(form, first, likelihood, members, key, Blocks(precision, np.zeros(members.shape)))
+        sites, none = Blocks(precision, np.zeros(members.shape)), np.zeros(0)
+        chain = BlockChain(jnp.asarray(none), form.hierarchy.begin(jax.random.fold_in(key, 0)))
+        own = "expectation propagation", ROUNDS, form.biases
+        swept = BlocksSwept(*[none] * 5)
+        return cls(*own, form, first, likelihood, members, key, sites, sites, chain, swept, none)
+
+    @property
+    def factors(self) -> Factors:
+        """The prior of what no hierarchy governs, and the sites of the last marginals."""
+        return self.likelihood.with_sites(self.members, self.before)
 
     def of_biases(self, values: np.ndarray) -> np.ndarray:
         """Values (B, p) of the members as (M,)."""
@@ -221,13 +249,11 @@ class Propagation:
     @property
     def mean(self) -> np.ndarray:
         """Means (M,) of likelihood and prior."""
-        assert self.swept is not None
         return self.of_biases(self.swept.mean)
 
     @property
     def variance(self) -> np.ndarray:
         """Variances (M,) of likelihood and prior."""
-        assert self.swept is not None
         return self.of_biases(np.diagonal(self.swept.covariance, axis1=1, axis2=2))
 
     def _marginals(self) -> BlockMarginals:
@@ -240,17 +266,16 @@ class Propagation:
 
     def round(self, turn: int) -> float:
         """Renew all sites; the root mean square of how far the means moved, in sds."""
-        self.found = found = self._marginals()
-        self.begun = found if self.begun is None else self.begun
+        found = self._marginals()
+        self.before = self.sites
         precision = invert(found.covariance)
         middle = np.append(found.mean, 0.0)[self.members]
         cavity = Blocks(
             without_negative(precision - self.sites.precision, LEAST),
             np.einsum("bij,bj->bi", precision, middle) - self.sites.pull,
         )
-        if self.chain is None:
-            begin = self.form.hierarchy.begin(jax.random.fold_in(self.key, 0))
-            self.chain = BlockChain(jnp.asarray(found.mean), begin)
+        if turn == 0:
+            self.begun, self.chain = found.covariance, self.chain._replace(z=jnp.asarray(found.mean))
         own = jax.random.fold_in(self.key, 1 + turn)
         self.chain, swept = sweep_blocks(self.form, self.first, self.members, cavity, self.chain, own)
         self.swept = swept = jax.device_get(swept)
@@ -266,18 +291,34 @@ class Propagation:
         off = self.of_biases((swept.mean - middle) / np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)))
         return float(np.sqrt(np.mean(off**2)))
 
-    def run(self, told: Callable[[int, float], bool] | None = None) -> None:
-        """Rounds until the means move by less than `CLOSE` sds in the root mean square, are spent,
-        or `told` ends them.
+    @property
+    def far(self) -> float:
+        """Sds (rms) by which the mean lies from the point of the likelihood."""
+        return float(np.sqrt(np.mean((self.mean - self.likelihood.z) ** 2 / self.variance)))
 
-        Between rounds the likelihood is taken anew at the mean.
-        """
-        for turn in range(ROUNDS):
-            off = self.round(turn)
-            ended = told is not None and told(turn, off)
-            far = np.sqrt(np.mean((self.mean - self.likelihood.z) ** 2 / self.variance))
-            self.settled = bool(turn >= SURE and off < CLOSE and far < NEAR)
-            if self.settled or ended or turn + 1 == ROUNDS:
-                break
-            if far >= AGAIN:
-                self.likelihood = self.likelihood.at(self.mean)
+    def init(self) -> PropagationState:
+        """The state before the first round."""
+        point = self.likelihood.here.point
+        return PropagationState(point, self.sites, self.before, self.chain, self.swept, self.begun, self.settled)
+
+    def resume(self, state: PropagationState) -> None:
+        """Stand where a state says; the likelihood is made anew where it is of another point."""
+        here = self.likelihood.here
+        if state.point is not here.point:
+            self.likelihood = replace(self.likelihood, here=self.likelihood.engine.at(here.model, state.point))
+        self.sites, self.before, self.chain, self.swept, self.begun, settled = state[1:]
+        self.settled = bool(settled)
+
+    def step(self, state: PropagationState, count: int, pause: Pause) -> tuple[PropagationState, Trace]:
+        """A round; before it the likelihood is taken anew at the mean where this has moved."""
+        self.resume(state)
+        if count and self.far >= AGAIN:
+            self.likelihood = self.likelihood.at(self.mean)
+        off = self.round(count)
+        self.settled = bool(count >= SURE and off < CLOSE and self.far < NEAR)
+        precision = self.of_biases(np.diagonal(self.sites.precision, axis1=1, axis2=2))
+        return self.init(), Trace(np.array([off]), self.mean[None], precision[None])
+
+    def ended(self, state: PropagationState, trace: Trace) -> bool:
+        """True where the means came to rest."""
+        return bool(state.settled)

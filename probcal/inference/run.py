@@ -1,12 +1,13 @@
-"""The outer loop of methods that climb to a point: jitted chunks, progress.
+"""Methods that climb to a point, and the task of their climb that `inference.loop` runs.
 
-A `Maximiser` has `iterate`, a pure step
-of its outer loop, and where needed `close`, what it computes at the end of a chunk; `maximise` drives one fit and
-a study many at once.
+A `Maximiser` has `iterate`, a pure step of its outer loop, and where needed `close`, what it computes at the end of a
+chunk; a study climbs many at once.
 """
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -26,6 +27,7 @@ from probcal.inference.ending import FAR, conclude
 from probcal.inference.engined import climb_on
 from probcal.inference.hierarchy import held, learnt_groups
 from probcal.inference.integrate import Integration, integrate
+from probcal.inference.loop import Pause, Task, Trace
 from probcal.inference.method import Context, Given, Iterated, State
 from probcal.inference.placed import Reached, with_places
 from probcal.model.model import Model
@@ -36,6 +38,65 @@ from probcal.results.answer import Answer
 
 CHUNK = 5  # outer iterations between two reports of progress
 STALLED = 8  # climbs on the host after which one that gains nothing is given up
+
+
+@dataclass(eq=False)
+class KernelClimb(Task):
+    """The iterations of a method from a start: in jitted chunks, or one by one where these are long."""
+
+    method: Any
+    model: Model
+    prior: Prior  # of the climb, without what reaches kernels as arrays
+    given: Given
+    start: Point
+    key: jax.Array
+    alpha: np.ndarray | None = None  # (M,) precisions to begin with, those of the prior if None
+
+    @classmethod
+    def of(
+        cls, method: Maximiser, problem: Problem, prior: Prior, start: Point, key: jax.Array,
+        alpha: np.ndarray | None = None,
+    ) -> KernelClimb:  # fmt: skip
+        """The climb on a problem.
+
+        Where precisions are not given, a bias that starts far from its stated value has that of its start: robust
+        noise would rather reject a sensor than hold an exchanged place against the declared scale.
+        """
+        check_method(method)
+        given = given_of(method, problem, prior)
+        far = (np.abs(start.z) > FAR) & ~held(prior, problem)
+        if alpha is None and prior.hierarchical and far.any():
+            alpha = np.where(far, np.maximum(np.abs(start.z), FAR) ** -2.0, given.prior.alpha)
+        own = method.name, method.iterations, problem.model.biases
+        return cls(*own, method, problem.model, bare(method.climbs_under(prior)), given, start, key, alpha)
+
+    @property
+    def on_host(self) -> bool:
+        """True where iterations are made one by one."""
+        return bool(self.method.steps_on_host(self.model, self.prior))
+
+    def init(self) -> State:
+        """The state before the first iteration."""
+        state = first_state(self.given, self.model, self.start, self.method.begin(self.model, self.start), self.key)
+        return state if self.alpha is None else state._replace(alpha=jnp.asarray(self.alpha))
+
+    def step(self, state: State, count: int, pause: Pause) -> tuple[State, Trace]:
+        """A chunk of iterations, or one."""
+        fixed = self.model, self.prior, self.given
+        if not self.on_host:
+            left = self.iterations - count
+            state, (course, idle) = chunk(kernel(self.method), *fixed, state, left)
+            return state, jax.tree.map(lambda leaf: np.asarray(leaf)[~np.asarray(idle)], course)
+        state = stepped(self.method, *fixed, state)
+        state = self.method.close(self.model.with_mixing(state.mixing), self.prior, self.given, state)
+        return state, jax.tree.map(lambda leaf: np.asarray(leaf)[None], course_of(state))
+
+    def ended(self, state: State, trace: Trace) -> bool:
+        """True where the method is done, or long iterations gain nothing any more."""
+        worth = trace.objective
+        if self.on_host and len(worth) > STALLED and not state.done:
+            return not max(worth[-STALLED:]) > max(worth[:-STALLED]) + self.method.tolerance
+        return bool(state.done)
 
 
 class Maximiser(Iterated, ABC):
@@ -63,7 +124,8 @@ class Maximiser(Iterated, ABC):
             mixed = integrate(how, problem.model, first, state.point, context.key, search=True)
         square = float(mean_square(problem.model, state.point if mixed is None else mixed.point))
         stopped = context.monitor.stopped
-        return conclude(problem, self, prior, state, trace, square, len(trace), how, mixed, stopped)
+        found = conclude(problem, self, prior, state, trace.objective, square, trace.iterations, how, mixed, stopped)
+        return replace(found, steps=trace.z, precisions=trace.alpha)
 
     def expands_by(self, model: Model, *, fast: bool = False) -> Engine | None:
         """The engine that a climb from the host asks; None where kernels of the dense one climb.
@@ -85,10 +147,10 @@ class Maximiser(Iterated, ABC):
         return "one start" if starts > 1 else ""
 
     def _with_places(
-        self, plain: Problem, prior: Prior, state: State, trace: np.ndarray, context: Context
-    ) -> tuple[Problem, State, np.ndarray]:
-        """The problem with what integrated places add, the state there and all objectives."""
-        traces, given, engine = [trace], given_of(self, plain, prior).prior, DenseEngine()
+        self, plain: Problem, prior: Prior, state: State, trace: Trace, context: Context
+    ) -> tuple[Problem, State, Trace]:
+        """The problem with what integrated places add, the state there and the course of all climbs."""
+        given, engine = given_of(self, plain, prior).prior, DenseEngine()
 
         def reached(problem: Problem, state: State) -> Reached:
             problem = problem.with_mixing(state.mixing)
@@ -99,8 +161,9 @@ class Maximiser(Iterated, ABC):
             return Reached(problem, at, factors, value, state)
 
         def climb(problem: Problem, start: Point) -> Reached:
+            nonlocal trace
             state, more = self.climb(problem, prior, start, context)
-            traces.append(more)
+            trace = trace.and_then(more)
             return reached(problem, state)
 
         end, agree = with_places(climb, reached(plain, state), engine, lambda: context.monitor.stopped)
@@ -109,7 +172,7 @@ class Maximiser(Iterated, ABC):
             found = laplace(end.at.model, state.point, given._replace(alpha=state.alpha))
             state = state._replace(found=found)
         done = state.done if agree else jax.device_put(np.array(False))
-        return end.problem, state._replace(done=done), np.concatenate(traces)
+        return end.problem, state._replace(done=done), trace
 
     def climbs_once(self, problem: Problem, prior: Prior) -> bool:
         """Whether an answer is what one climb finds (and an integration there), so that many are one kernel."""
@@ -121,9 +184,11 @@ class Maximiser(Iterated, ABC):
         """Whether trajectories are integrated, so that places that are far from Gaussian matter."""
         return self.trajectory == "marginal"
 
-    def climb(self, problem: Problem, prior: Prior, start: Point, context: Context) -> tuple[State, np.ndarray]:
-        """The last state of the outer loop and the objectives on the way."""
-        return maximise(self, problem, prior, start, context)
+    def climb(
+        self, problem: Problem, prior: Prior, start: Point, context: Context, alpha: np.ndarray | None = None
+    ) -> tuple[State, Trace]:
+        """The last state of the outer loop and its course, from precisions `alpha` (M,) where these are given."""
+        return context.run(KernelClimb.of(self, problem, prior, start, context.key, alpha))
 
     def climbs_under(self, prior: Prior) -> Prior:
         """The prior of the climb: where precisions are integrated after it, not that of the fit."""
@@ -228,54 +293,24 @@ def learn(prior: Prior, given: Given, alpha: jax.Array, gamma: Any, variance: An
 @partial(jax.jit, static_argnames=("method", "prior"))
 def chunk(
     method: Any, model: Model, prior: Prior, given: Given, state: State, left: int
-) -> tuple[State, tuple[jax.Array, jax.Array]]:
-    """A few outer iterations, at most `left`; stops when done. Returns objectives and which steps were idle."""
+) -> tuple[State, tuple[Trace, jax.Array]]:
+    """A few outer iterations, at most `left`; stops when done. Returns their course and which steps were idle."""
 
-    def body(state: State, k: jax.Array) -> tuple[State, tuple[jax.Array, jax.Array]]:
+    def body(state: State, k: jax.Array) -> tuple[State, tuple[Trace, jax.Array]]:
         idle = state.done | (k >= left)
         after = jax.lax.cond(idle, lambda s: s, lambda s: stepped(method, model, prior, given, s), state)
-        return after, (after.objective, idle)
+        return after, (course_of(after), idle)
 
     state, trace = jax.lax.scan(body, state, jnp.arange(CHUNK))
     return method.close(model.with_mixing(state.mixing), prior, given, state), trace
+
+
+def course_of(state: State) -> Trace:
+    """The course of a climb as far as one state tells it."""
+    return Trace(state.objective, state.point.z, state.alpha)
 
 
 def stepped(method: Any, model: Model, prior: Prior, given: Given, state: State) -> State:
     """One outer iteration at the precisions of the process noise that a state has; two without an objective end it."""
     after: State = method.iterate(model.with_mixing(state.mixing), prior, given, state)
     return after._replace(done=after.done | (jnp.isnan(after.objective) & jnp.isnan(state.objective)))
-
-
-def maximise(
-    method: Maximiser, problem: Problem, prior: Prior, start: Point, context: Context, alpha: np.ndarray | None = None
-) -> tuple[State, np.ndarray]:
-    """Run a method from a start until it is done, spent or stopped.
-
-    The last state and the objectives.
-
-    It begins with precisions `alpha` (M,), those of the prior if None. Where these are not given, a
-    bias that starts far from its stated value has that of its start: robust noise would rather
-    reject a sensor than hold an exchanged place against the declared scale.
-    """
-    check_method(method)
-    given = given_of(method, problem, prior)
-    far = (np.abs(start.z) > FAR) & ~held(prior, problem)
-    if alpha is None and prior.hierarchical and far.any():
-        alpha = np.where(far, np.maximum(np.abs(start.z), FAR) ** -2.0, given.prior.alpha)
-    prior = bare(method.climbs_under(prior))
-    state = first_state(given, problem.model, start, method.begin(problem.model, start), context.key)
-    state = state if alpha is None else state._replace(alpha=jnp.asarray(alpha))
-    trace = np.zeros(0)
-    while len(trace) < method.iterations and not bool(state.done) and not (len(trace) and context.monitor.stopped):
-        if method.steps_on_host(problem.model, prior):
-            state = stepped(method, problem.model, prior, given, state)
-            state = method.close(problem.model.with_mixing(state.mixing), prior, given, state)
-            trace = np.append(trace, float(state.objective))
-            if len(trace) > STALLED and not max(trace[-STALLED:]) > max(trace[:-STALLED]) + method.tolerance:
-                break  # it wanders: each of these is many steps
-        else:
-            left = method.iterations - len(trace)
-            state, (objective, idle) = chunk(kernel(method), problem.model, prior, given, state, left)
-            trace = np.concatenate([trace, np.asarray(objective)[~np.asarray(idle)]])
-        context.monitor.tell(method.name, len(trace), method.iterations, float(trace[-1]), bound=True)
-    return state, trace

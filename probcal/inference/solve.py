@@ -43,6 +43,8 @@ def solve(
     Rows of free clocks are taken where the answer puts them: its problem is then the given one `retimed`, solved again
     until no clock moves by `STILL` sd. A sampler takes them where the joint mode does.
     """
+    if starts < 1:
+        raise InputError(f"starts={starts}: at least one start is needed")
     if not problem.clocks.any():
         return _solve(problem, method, prior, context, start, starts)
     monitor = context.monitor

@@ -1,13 +1,18 @@
 """Work on its way to disk: a folder with the numbered parts of one run, each whole or absent, safe against a kill.
 
 A folder holds the manifest of a run (what it is, see `identity`) and a file for every part: a chunk of a sampler's
-draws with the state after it, or the records of some runs of `sbc`. Every part carries its number, the digest of its
-run and a checksum, and is written in one step. The fits of a study are one zarr store instead (`fits.py`). One process
-at a time works in a folder. Nothing is removed but files that carry the names made here, in a folder with a manifest.
+draws with the state after it, the state and course of a loop of a climb, or the records of some runs of `sbc`. Every
+part carries its number, the digest of its run and a checksum, and is written in one step. The fits of a study are one
+zarr store instead (`fits.py`). One process at a time works in a folder. Nothing is removed but files that carry the
+names made here, in a folder with a manifest.
 """
 
+from __future__ import annotations
+
+import hashlib
 import io
 import os
+import time
 import zipfile
 from collections.abc import Mapping, Sequence
 from os import PathLike
@@ -39,6 +44,7 @@ from probcal.inference.manifest import (
 )
 
 Arrays = Mapping[str, Any]
+EVERY = 2.0  # s from one state of a climb that is written to the next
 
 
 class Storage:
@@ -59,6 +65,7 @@ class Storage:
         self._numbers: set[int] = set()
         self._parts: dict[int, dict[str, np.ndarray]] = {}  # of a run in memory
         self._lock: Lock | None = None
+        self._loops = 0  # begun so far, of a fit whose loops are kept
         if self.path is None:
             return
         self._made = not self.path.exists()
@@ -151,6 +158,13 @@ class Storage:
             write_whole(self._file(number), content.getbuffer())
         self._numbers.add(number)
 
+    def checkpoint(self, first: Sequence[Any]) -> Checkpoint | None:
+        """The part of the next loop of a fit, whose first state has these leaves; None where loops are not kept."""
+        if self.path is None or self.kind != "climb":
+            return None
+        self._loops += 1
+        return Checkpoint(self, self._loops - 1, first)
+
     def close(self) -> None:
         """Let another process work in the folder; one without any part is left as it was found."""
         if self.path is None or self._lock is None:
@@ -162,6 +176,11 @@ class Storage:
         self._lock = None
 
 
+def numbered(part: Arrays, name: str) -> list[Any]:
+    """Arrays of a part that share a name, in order."""
+    return [part[f"{name}_{k}"] for k in range(sum(own.startswith(f"{name}_") for own in part))]
+
+
 class Chunks:
     """Draws of a sampler in order, (chains, draws, ...) by name, and the state after the last."""
 
@@ -169,8 +188,7 @@ class Chunks:
         self.storage = storage
         self.state: list[np.ndarray] | None = None
         for number in range(self.count):  # all of them, so that a damaged or missing one is told before any work
-            found = storage.read(number)
-            self.state = [found[f"state_{k}"] for k in range(sum(name.startswith("state_") for name in found))]
+            self.state = numbered(storage.read(number), "state")
 
     @property
     def count(self) -> int:
@@ -191,6 +209,33 @@ class Chunks:
             for part in map(self.storage.read, self.storage.numbers[first:last])
         ]
         return {name: np.concatenate([chunk[name] for chunk in chunks], 1) for name in chunks[-1]}
+
+
+class Checkpoint:
+    """State and course of one loop of a fit, in one part that is written anew while the loop runs.
+
+    The part of a loop that began otherwise is left out.
+    """
+
+    def __init__(self, storage: Storage, number: int, first: Sequence[Any]):
+        self.storage, self.number, self.written = storage, number, time.monotonic()
+        self.begun = np.array(hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in first)).hexdigest())
+        self.found: tuple[list[np.ndarray], list[np.ndarray]] | None = None  # leaves of the state; the course
+        if number in storage.numbers and (part := storage.read(number))["begun"] == self.begun:
+            self.found = numbered(part, "state"), numbered(part, "course")
+
+    @property
+    def due(self) -> bool:
+        """True where the state has not been written for some time."""
+        return time.monotonic() - self.written >= EVERY
+
+    def write(self, state: Sequence[Any], course: Sequence[Any]) -> None:
+        """Replace the part."""
+        named = {
+            f"{kind}_{k}": leaf for kind, own in (("state", state), ("course", course)) for k, leaf in enumerate(own)
+        }
+        self.storage.add(self.number, named | {"begun": self.begun})
+        self.written = time.monotonic()
 
 
 class Records:

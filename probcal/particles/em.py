@@ -13,6 +13,7 @@ import numpy as np
 from probcal import linalg
 from probcal.gaussian.search import halved
 from probcal.inference.hierarchy import held
+from probcal.inference.loop import Pause, Task, Trace
 from probcal.inference.method import Context, Given
 from probcal.inference.run import bare, check_method, given_of, learn
 from probcal.model.model import At, Model
@@ -56,17 +57,9 @@ class Climb(NamedTuple):
     pull: jax.Array  # (M,) averaged, of its linear term about zero
     k: jax.Array  # () passes done
     key: jax.Array
-    paths: tuple[
-        Any, ...
-    ]  # of each recursion the path that the next conditional filter holds; none where it is not one
-
-
-class Trace(NamedTuple):
-    """Of every iteration."""
-
-    z: jax.Array  # (I, M)
-    variance: jax.Array  # (I, M) of each bias at given states
-    log_likelihood: jax.Array  # (I,) at the biases before the step, trajectories integrated, or given where averaged
+    paths: tuple[Any, ...]  # that the next conditional filter of each recursion holds; none where it is not one
+    variance: jax.Array  # (M,) of each bias at given states
+    log_likelihood: jax.Array  # () before the last step, trajectories integrated, or given where averaged
 
 
 @partial(jax.jit, static_argnames=("prior", "how"))
@@ -77,19 +70,16 @@ def em_chunk(
     """A few iterations, none after the `last`."""
 
     def one(state: Climb, _: None) -> tuple[Climb, Trace]:
-        blank = Trace(state.z, jnp.zeros_like(state.z), jnp.zeros(()))
-        return jax.lax.cond(
-            state.k < last,
-            lambda: iterate(model, targets, prior, given, state, how),
-            lambda: (state, blank),
-        )
+        going = state.k < last
+        state = jax.lax.cond(going, lambda: iterate(model, targets, prior, given, state, how), lambda: state)
+        return state, Trace(state.log_likelihood, state.z, state.alpha)
 
     return jax.lax.scan(one, state, None, length=CHUNK)
 
 
 def iterate(
     model: Model, targets: tuple[Targets, ...], prior: Prior, given: Given, state: Climb, how: ParticleSettings
-) -> tuple[Climb, Trace]:
+) -> Climb:
     """One E-step and one M-step, with the prior of the biases (Paper A 20-21), then precisions and levels."""
     keys, now = jax.random.split(state.key), given.prior._replace(alpha=state.alpha)
     share = COOL ** jnp.maximum(1.0 - state.k / max(how.tempered, 1), 0.0) if how.tempered else jnp.ones(())
@@ -118,8 +108,8 @@ def iterate(
     levels = state.levels
     if model.level_spread.shape[0]:
         levels = moved_levels(model, targets, found, z, levels)
-    after = state._replace(z=z, levels=levels, alpha=alpha, k=state.k + 1, key=keys[1])
-    return after, Trace(z, variance, told)
+    done = {"k": state.k + 1, "variance": variance, "log_likelihood": told}
+    return state._replace(z=z, levels=levels, alpha=alpha, key=keys[1], **done)
 
 
 def _averaged(state: Climb, expected: Expectation, how: ParticleSettings) -> Climb:
@@ -149,7 +139,7 @@ def _shortened(model: Model, found: Ensemble, states: Any, state: Climb, now: Pr
 
 @dataclass(frozen=True)
 class Wandering:
-    """How the last iterations compare with as many before them."""
+    """The comparison of the last iterations with as many before them."""
 
     still: bool
     worst: int  # the bias that moved most
@@ -177,27 +167,50 @@ def _variance_of_mean(trace: np.ndarray) -> np.ndarray:
     return np.asarray(around.var(0) * (1 + r) / (1 - r) / len(trace))
 
 
+@dataclass(eq=False)
+class ParticleClimb(Task):
+    """The iterations of EM by particles, from biases z (M,); it ends where these only scatter about a place."""
+
+    problem: Problem
+    targets: tuple[Targets, ...]
+    how: ParticleSettings
+    prior: Prior
+    given: Given
+    z: Any
+    key: jax.Array
+    settles: bool = False  # whether it may end before all iterations are done
+
+    def init(self) -> Climb:
+        """The state before the first iteration."""
+        for own in self.targets if self.how.m_step == "averaged" else ():
+            own.model.check_density()
+        alpha, z = self.given.prior.alpha, np.asarray(self.z, float)
+        return _beginning(self.problem.model, self.targets, alpha, z, self.key, self.how)
+
+    def step(self, state: Climb, count: int, pause: Pause) -> tuple[Climb, Trace]:
+        """A chunk of iterations."""
+        last, left = jnp.asarray(self.iterations), self.iterations - count
+        state, trace = em_chunk(self.problem.model, self.targets, self.prior, self.given, state, last, self.how)
+        return state, jax.tree.map(lambda leaf: np.asarray(leaf)[:left], trace)
+
+    def ended(self, state: Climb, trace: Trace) -> bool:
+        """True where the biases only scatter."""
+        return self.settles and trace.iterations >= 2 * WINDOW and self.wandering(state, trace).still
+
+    def wandering(self, state: Climb, trace: Trace) -> Wandering:
+        """The comparison of the last iterations with as many before them."""
+        return wandering(trace.z, np.sqrt(state.variance))
+
+
 def climb(problem: Problem, how: ParticleSettings, prior: Prior, z: Any, iterations: int, key: jax.Array) -> Climb:
     """Where the loop stands after some iterations from biases z (M,) under a prior: a start for a sampler."""
     given = Given(
         prior.precision(problem.labels, problem.surveyed), jnp.asarray(held(prior, problem)),
         jnp.arange(problem.model.biases), jnp.zeros(()),
     )  # fmt: skip
-    targets = prepared(problem, how)
-    state = _begun(problem, targets, how, given, z, key)
-    while int(state.k) < iterations:
-        state, _ = em_chunk(problem.model, targets, bare(prior), given, state, jnp.asarray(iterations), how)
+    own = "start", iterations, problem.model.biases
+    state, _ = Context(key).run(ParticleClimb(*own, problem, prepared(problem, how), how, bare(prior), given, z, key))
     return state
-
-
-def _begun(
-    problem: Problem, targets: tuple[Targets, ...], how: ParticleSettings, given: Given, z: Any, key: jax.Array
-) -> Climb:
-    """The state before the first iteration."""
-    if how.m_step == "averaged":
-        for own in targets:
-            own.model.check_density()
-    return _beginning(problem.model, targets, given.prior.alpha, np.asarray(z, float), key, how)
 
 
 @partial(jax.jit, static_argnames="how")
@@ -210,7 +223,8 @@ def _beginning(
         crowd = replace(how, count=max(how.count, CROWD))
         cool = tuple(weigh_rows(own, jnp.asarray(COOL if how.tempered else 1.0)) for own in targets)
         paths = first_paths(targets, ensemble(model, cool, z, levels, keys[1], crowd))
-    return Climb(z, levels, alpha, jnp.zeros((M, M)), jnp.zeros(M), jnp.zeros((), int), keys[0], paths)
+    nothing, none = jnp.zeros((M, M)), jnp.zeros(M)
+    return Climb(z, levels, alpha, nothing, none, jnp.zeros((), int), keys[0], paths, none, jnp.zeros(()))
 
 
 def climb_by_particles(
@@ -226,27 +240,15 @@ def climb_by_particles(
     how = replace(how, tempered=0) if np.any(np.asarray(z)) else how  # a start that is known is not left again
     model, given = problem.model, given_of(method, problem, prior)
     keys = jax.random.split(context.key)
-    state = _begun(problem, targets, how, given, z, keys[0])
-    parts: list[Trace] = []
-    count, known, still, stopped = 0, bare(prior), Wandering(False, 0, np.inf), ""
-    while count < method.iterations:
-        state, part = em_chunk(model, targets, known, given, state, jnp.asarray(method.iterations), how)
-        part = jax.tree.map(lambda leaf, left=method.iterations - count: np.asarray(leaf)[:left], part)
-        parts.append(part)
-        count += len(part.log_likelihood)
-        context.monitor.tell(method.name, count, method.iterations, float(part.log_likelihood[-1]), bound=True)
-        traced = np.concatenate([own.z for own in parts])
-        still = wandering(traced, np.sqrt(part.variance[-1]))
-        settled = method.tolerance > 0 and count >= 2 * WINDOW and still.still
-        stopped = "" if settled or count >= method.iterations else context.monitor.stopped
-        if settled or stopped:
-            break
-    trace = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    own = method.name, method.iterations, model.biases
+    task = ParticleClimb(*own, problem, targets, how, bare(prior), given, z, keys[0], method.tolerance > 0)
+    state, trace = context.run(task)
+    still = task.wandering(state, trace)
+    over = trace.iterations >= method.iterations or task.ended(state, trace)
+    stopped = "" if over else context.monitor.stopped
     if still.still and how.m_step != "averaged":  # what is left is the noise of the particles
         state = state._replace(z=jnp.asarray(trace.z[-min(WINDOW, len(trace.z) // 2) :].mean(0)))
-    ended = Ended(
-        state.z, state.levels, state.alpha, trace.log_likelihood, trace.z, still.still, _moved(problem, still), stopped
-    )
+    ended = Ended(state.z, state.levels, state.alpha, trace, still.still, _moved(problem, still), stopped)
     return conclude_particles(problem, method, how, prior, given, targets, ended, keys[1])
 
 

@@ -17,6 +17,7 @@ from probcal.gaussian.draws import draw_biases, predictive
 from probcal.gaussian.information import rejected
 from probcal.gaussian.mode import Point
 from probcal.inference.ending import ABSURD, conclude_at
+from probcal.inference.loop import Trace
 from probcal.inference.method import Given
 from probcal.inference.mixture import gaussian_biases
 from probcal.labels import listed
@@ -90,8 +91,7 @@ class Ended(NamedTuple):
     z: jax.Array  # (M,)
     levels: jax.Array  # (H,)
     alpha: jax.Array  # (M,)
-    trace: np.ndarray  # (I,) log-likelihood of every iteration, estimated
-    steps: np.ndarray  # (I, M) biases after every iteration
+    trace: Trace  # its objective is an estimated log-likelihood
     still: bool
     said: str  # what still moves
     stopped: str = ""  # why it was ended early
@@ -323,15 +323,17 @@ def conclude_particles(
     error, stopped = float(np.max(slope.sd_error, initial=0.0)), bool(ended.stopped)
     worst = problem.labels[int(np.argmax(slope.sd_error))] if error else ""
     left, asked = notable_scatter(posterior.problem, posterior.point), method.tolerance == 0
-    return conclude_at(
-        posterior.problem, method, prior, posterior, ended.trace, np.nan, len(ended.trace), converged=ended.still,
-        evidence=told.log_likelihood, stopped=ended.stopped, steps=ended.steps,
+    worths, count = ended.trace.objective, ended.trace.iterations
+    answer = conclude_at(
+        posterior.problem, method, prior, posterior, worths, np.nan, count, converged=ended.still,
+        evidence=told.log_likelihood, stopped=ended.stopped,
         misfit=unexplained(posterior.problem, posterior.point),
         left=0.0 if stopped else left, ahead=ahead if ahead > AHEAD and not stopped else 0.0,
         inexact=(worst, error, slope.filters) if error > SD_ERROR and not stopped else (),
         better="more particles" if how.m_step == "averaged" else 'm_step="averaged", more particles',
         moved=ended.said if asked else "", moving="" if asked else ended.said,
     )  # fmt: skip
+    return replace(answer, steps=ended.trace.z, precisions=ended.trace.alpha)
 
 
 def steepness(slope: np.ndarray, covariance: np.ndarray, noise: np.ndarray) -> float:

@@ -279,6 +279,7 @@ class Answer:
     iterations: int  # of the outer loop, or draws a chain
     trace: np.ndarray | None = None  # objective of every outer iteration
     steps: np.ndarray | None = None  # (I, M) biases after every outer iteration, where they are kept
+    precisions: np.ndarray | None = None  # (I, M) of these biases after every outer iteration
     interrupted: bool = False
     motion: str = "used"  # or "left out", for least squares
     optima: tuple[Answer, ...] = ()  # those found from several starts

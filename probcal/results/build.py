@@ -64,7 +64,9 @@ def build(answer: Answer, directions: Sequence[Any], key: jax.Array, keep: tuple
         **_data_groups(answer, draws, before, large),
     }
     if answer.trace is not None:
-        steps = {} if answer.steps is None else {"bias": (("iteration", "bias_label"), answer.steps * problem.scales)}
+        dims = ("iteration", "bias_label")
+        steps = {} if answer.steps is None else {"bias": (dims, answer.steps * problem.scales)}
+        steps |= {} if answer.precisions is None else {"precision": (dims, answer.precisions)}
         coords = {"bias_label": list(problem.labels)} if steps else {}
         groups["optimisation"] = xr.Dataset({"objective": ("iteration", answer.trace), **steps}, coords=coords)
     if posterior.stats:
