@@ -141,6 +141,7 @@ def _parameters(model: Model, point: Point, spread: Data, before: jax.Array) -> 
     return jax.lax.fori_loop(0, STEPS, step, start)
 
 
+@jax.jit
 def at_levels(model: Model, point: Point, levels: jax.Array) -> Point:
     """The same trajectories and biases at other noise levels: the whitened noises are rescaled."""
     ratio = jnp.concatenate([jnp.exp(point.levels - levels), jnp.ones(1)])

@@ -152,7 +152,7 @@ def take_up(problem: Problem, fit: xr.DataTree) -> Judged:
     data = pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()})
     spread = SensorBlocks.read(group, problem.labels, "assess", problem.scales)
     asked = "dense" if "block" not in group else "iterative" if "sd_error" in group else factoriser()
-    engine, point = engine_of(asked, problem.model), point_of(problem, fit)
+    engine, point = engine_of(asked, problem.model), point_of(problem, fit, group)
     if fit.attrs.get("places") == "integrated":
         problem = problem.with_tilt(tilt_at(problem.model, point))
     at = engine.at(problem.model, point)
@@ -169,15 +169,14 @@ def _weighted(problem: Problem, tracked: dict[str, xr.Dataset]) -> Problem:
     return problem.with_mixing(problem.model.each(saved, problem.epochs))
 
 
-def point_of(problem: Problem, fit: xr.DataTree) -> Point:
-    """Biases and levels of the tree, trajectories at their mode, searched from the saved ones."""
+def point_of(problem: Problem, fit: xr.DataTree, group: xr.Dataset) -> Point:
+    """Biases (of the group `calibration`) and levels of the tree, trajectories at their mode, searched from the saved ones."""
     tracked = dict(each_track(fit))
     saved = [saved_by_epoch(epochs, tracked, "mean", "targets") for epochs in problem.epochs]
     point = follow_states(problem, saved)
     if problem.levels:
         level = fit["level"].to_dataset()
         point = at_levels(problem.model, point, jnp.asarray(level_logs(problem.levels, level["std"].values)))
-    group = fit["calibration"].to_dataset()
     z = jnp.asarray(group["point" if "point" in group else "mean"].values / problem.scales)
     return track_mode(problem, point._replace(z=z))
 
