@@ -170,7 +170,7 @@ def _weighted(problem: Problem, tracked: dict[str, xr.Dataset]) -> Problem:
 
 
 def point_of(problem: Problem, fit: xr.DataTree, group: xr.Dataset) -> Point:
-    """Biases (of the group `calibration`) and levels of the tree, trajectories at their mode, searched from the saved ones."""
+    """Biases and levels of the tree, trajectories at their mode, searched from the saved ones."""
     tracked = dict(each_track(fit))
     saved = [saved_by_epoch(epochs, tracked, "mean", "targets") for epochs in problem.epochs]
     point = follow_states(problem, saved)
