@@ -85,7 +85,7 @@ MUTATIONS = [
     Mutation("information + linalg.gram_less(new, alone)", "information + linalg.gram(new)", "test_exact.py"),
     Mutation("0.5 * known + widening(model, point.levels)", "0.5 * known", "test_formulas.py"),
     Mutation("return proposal, 0.5 * slope", "return proposal, slope", "test_guards.py"),
-    Mutation("~last.moved & ~converged", "last.moved & ~converged", "test_guards.py"),
+    Mutation("~moved & ~converged", "moved & ~converged", "test_guards.py"),
     # gaussian/marginal.py
     Mutation("slope = own + jax.grad(along)(point.z)", "slope = own", "test_marginal.py"),
     Mutation("tuple(-own - jnp.einsum(", "tuple(0 * own - 0 * jnp.einsum(", "test_marginal.py"),

@@ -190,9 +190,9 @@ class Looked(NamedTuple):
 def test_a_search_from_the_host_is_the_traced_one_and_damped_where_no_precision_is_positive(far):
     with jax.enable_x64(True):
         start = Point((), (), np.array([far, 3.0]), np.zeros(0))
-        host, trace = climb_on_host(Wells(), start, 2, 60, 1e-12)
+        host, trace, _ = climb_on_host(Wells(), start, 2, 60, 1e-12)
         traced = jax.device_get(jax.jit(lambda start: climb_traced(Wells(), start, 2, 60, 1e-12))(start))
-        nowhere, _ = climb_on_host(Wells(), start._replace(z=np.full(2, np.nan)), 2, 60, 1e-12)
+        nowhere, *_ = climb_on_host(Wells(), start._replace(z=np.full(2, np.nan)), 2, 60, 1e-12)
     assert host.converged
     np.testing.assert_allclose(np.abs(host.at.z), [1.0, 0.0], atol=1e-5)
     assert (host.taken, host.count) == (traced.taken, traced.count)

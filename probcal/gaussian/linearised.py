@@ -16,12 +16,12 @@ from probcal.gaussian.mode import (
     Compressed,
     Eliminated,
     Point,
-    compress,
+    compress_rows,
     eliminate_compressed,
     factors,
     log_density,
     mixing_gain,
-    tilted,
+    rows_at,
 )
 from probcal.gaussian.solves import Dense
 from probcal.model.model import Data, Model, Where
@@ -114,21 +114,15 @@ def given_biases(model: Model, levels: jax.Array, solved: Eliminated) -> tuple[G
     return tuple(found)
 
 
-@jax.jit
 def linearise_rows(model: Model, point: Where) -> tuple[Linearised, ...]:
     """All rows linearised at a point with the expected information."""
-    return model.linearise(point, expected=True)
-
-
-@jax.jit
-def compress_rows(model: Model, z: jax.Array, rows: tuple[Linearised, ...]) -> Compressed:
-    """Linearised rows compressed onto states and biases."""
-    return tilted(model, z, compress(model, rows))
+    found: tuple[Linearised, ...] = rows_at(model, point, True)
+    return found
 
 
 def compress_and_eliminate(model: Model, point: Point, rows: tuple[Linearised, ...]) -> tuple[Compressed, Eliminated]:
     """Linearised rows compressed, and the system without its trajectories."""
-    system = compress_rows(model, point.z, rows)
+    system = compress_rows(model, point.z, rows, True)
     return system, eliminate_compressed(model, point.noises, point.levels, system)
 
 

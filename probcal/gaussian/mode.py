@@ -15,7 +15,7 @@ import numpy as np
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.room import check_room
-from probcal.gaussian.search import DAMPING, ROUNDING, between, damped_on, halved
+from probcal.gaussian.search import DAMPING, ROUNDING, between, branch, damped_on, halved, until_over
 from probcal.gaussian.solves import Dense
 from probcal.model.model import At, Model, Recursion, Where
 from probcal.model.rows import Linearised
@@ -170,14 +170,26 @@ def cost(model: Model, point: Point, prior: Precision) -> jax.Array:
 
 def eliminate(model: Model, point: Point, *, expected: bool, joint: bool = True) -> Eliminated:
     """Linearise at a point and eliminate every trajectory; without `joint` the biases are held."""
-    return eliminate_rows(model, point, model.linearise(point, expected=expected), joint=joint)
+    return eliminate_rows(model, point, rows_at(model, point, expected), joint=joint)
+
+
+@partial(jax.jit, static_argnames="expected")
+def rows_at(model: Model, point: Where, expected: bool) -> tuple[Linearised, ...]:
+    """All rows linearised at a point."""
+    return model.linearise(point, expected=expected)
 
 
 def eliminate_rows(model: Model, point: Point, lins: Sequence[Linearised], *, joint: bool = True) -> Eliminated:
     """Eliminate every trajectory from rows linearised around a point by any rule."""
-    compressed = compress(model, lins, joint=joint)
-    compressed = tilted(model, point.z, compressed) if joint else compressed
+    compressed = compress_rows(model, point.z, tuple(lins), joint)
     return eliminate_compressed(model, point.noises, point.levels, compressed, joint=joint)
+
+
+@partial(jax.jit, static_argnames="joint")
+def compress_rows(model: Model, z: jax.Array, lins: tuple[Linearised, ...], joint: bool) -> Compressed:
+    """Rows compressed onto states and biases, with the tilt of the model at z."""
+    compressed = compress(model, lins, joint=joint)
+    return tilted(model, z, compressed) if joint else compressed
 
 
 def compress(model: Model, lins: Sequence[Linearised], *, joint: bool = True) -> Compressed:
@@ -216,7 +228,7 @@ def eliminate_compressed(
     """
     parts = model.each_layout(compressed.states, compressed.crosses)
     kept = tuple(
-        Kept(J, pull, cross, _gains(part, levels, J, model.entries(r)))
+        Kept(J, pull, cross, gains_of(part, levels, J, model.entries(r)))
         for r, (part, (J, pull), cross) in enumerate(parts)
     )
     information, score, logdet = _eliminated(model, noises, levels, compressed[:2], kept, joint)
@@ -224,7 +236,7 @@ def eliminate_compressed(
 
 
 @partial(jax.jit, static_argnames="used")
-def _gains(part: Recursion, levels: jax.Array, J: jax.Array, used: tuple[int, ...]) -> rec.Gains:
+def gains_of(part: Recursion, levels: jax.Array, J: jax.Array, used: tuple[int, ...]) -> rec.Gains:
     """The covariance pass of a recursion, a kernel that models with other biases share."""
     return rec.gains(part.F, factors(part, levels), J, used)
 
@@ -301,17 +313,6 @@ def shortened(
     return between(point, proposal, share), value, share
 
 
-class _Search(NamedTuple):
-    point: Point
-    cost: jax.Array
-    damping: jax.Array
-    change: jax.Array
-    still: jax.Array  # no step lowers the cost by more than its rounding, and none promised to
-    moved: jax.Array  # some step lowered the cost
-    iteration: jax.Array
-    done: jax.Array
-
-
 class Mode(NamedTuple):
     """Outcome of a search for the mode."""
 
@@ -324,9 +325,15 @@ class Mode(NamedTuple):
     volume: jax.Array  # 1/2 log det W of a marginal mode, which its cost counts; 0 of a joint one
 
 
-@partial(jax.jit, static_argnames=("joint", "once"))
+class _Search(NamedTuple):
+    mode: Mode  # so far
+    begun: jax.Array  # the cost at the start
+    damping: jax.Array
+    over: jax.Array
+
+
 def find_mode(
-    model: Model, start: Point, prior: Precision, iterations: int, tolerance: float, *, joint: bool = True,
+    model: Model, start: Point, prior: Precision, iterations: int, tolerance: Any, *, joint: bool = True,
     once: bool = False, known: Eliminated | None = None,
 ) -> Mode:  # fmt: skip
     """Damped Gauss-Newton (iterated EKS, with the biases if `joint`) until the cost changes by less than `tolerance`.
@@ -341,33 +348,45 @@ def find_mode(
         return eliminate(model, point, expected=False, joint=joint)
 
     def body(s: _Search) -> _Search:
-        solved = at(s.point) if known is None else jax.lax.cond(s.iteration == 0, lambda _: known, at, s.point)
-        proposal, promised = _proposal(model, s.point, prior, s.damping, joint, solved)
+        point = s.mode.point
+        solved = at(point) if known is None else branch(s.mode.iterations == 0, lambda _: known, at, point)
+        return _stepped(model, prior, s, solved, iterations, tolerance, joint, once)
 
-        point, value, share = shortened(model, s.point, proposal, prior, s.cost)
-        better, damping = share > 0, damped_on(s.damping, share)
-        change = jnp.where(better, s.cost - value, jnp.inf)
-        rounding = ROUNDING * jnp.abs(s.cost)
-        small = jnp.abs(promised) <= jnp.maximum(tolerance, rounding)
-        still = (~better | (change <= rounding)) & (s.damping <= 1.0) & small & jnp.isfinite(s.cost)
-        done = (better & (change < tolerance) & (s.damping <= 1.0)) | (damping > DAMPING) | still
-        moved = s.moved | (better & (change > 0))
-        return _Search(point, value, damping, change, still, moved, s.iteration + 1, done)
+    return until_over(body, _begun(model, start, prior, iterations)).mode
 
-    first = _Search(
-        start,
-        cost(model, start, prior),
-        jnp.zeros(()),
-        jnp.full((), jnp.inf, float),
-        jnp.zeros((), bool),
-        jnp.zeros((), bool),
-        jnp.zeros((), int),
-        jnp.zeros((), bool),
-    )
-    last = jax.lax.while_loop(lambda s: ~s.done & (s.iteration < iterations) & ~(once & s.moved), body, first)
-    converged = last.done & ((last.change < tolerance) | last.still)
-    gained = first.cost - last.cost
-    return Mode(last.point, last.cost, last.iteration, converged, ~last.moved & ~converged, gained, jnp.zeros(()))
+
+@jax.jit
+def _begun(model: Model, start: Point, prior: Precision, iterations: int) -> _Search:
+    value, zero, no = cost(model, start, prior), jnp.zeros(()), jnp.zeros((), bool)
+    mode = Mode(start, value, jnp.zeros((), int), no, ~no, zero, zero)
+    return _Search(mode, value, zero, no | (iterations <= 0))
+
+
+@partial(jax.jit, static_argnames=("joint", "once"))
+def _stepped(
+    model: Model,
+    prior: Precision,
+    s: _Search,
+    solved: Eliminated,
+    iterations: int,
+    tolerance: float,
+    joint: bool,
+    once: bool,
+) -> _Search:
+    before = s.mode
+    proposal, promised = _proposal(model, before.point, prior, s.damping, joint, solved)
+    point, value, share = shortened(model, before.point, proposal, prior, before.cost)
+    better, damping = share > 0, damped_on(s.damping, share)
+    change = jnp.where(better, before.cost - value, jnp.inf)
+    rounding = ROUNDING * jnp.abs(before.cost)
+    small = jnp.abs(promised) <= jnp.maximum(tolerance, rounding)
+    # no step lowers the cost by more than its rounding, and none promised to
+    still = (~better | (change <= rounding)) & (s.damping <= 1.0) & small & jnp.isfinite(before.cost)
+    done = (better & (change < tolerance) & (s.damping <= 1.0)) | (damping > DAMPING) | still
+    moved = (before.gained > 0) | (better & (change > 0))
+    converged, count = done & ((change < tolerance) | still), before.iterations + 1
+    mode = Mode(point, value, count, converged, ~moved & ~converged, s.begun - value, before.volume)
+    return _Search(mode, s.begun, damping, done | (count >= iterations) | (once & moved))
 
 
 class _Tracking(NamedTuple):

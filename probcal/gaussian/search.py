@@ -78,8 +78,8 @@ def search_step(objective: Objective, s: Search, at: Any, tolerance: Any) -> Sea
     step."""
     value = objective.value(at)
     better = (s.value - value >= ENOUGH * s.share * s.promised) & (value <= s.value)
-    s = _either(better | (s.taken == 0), partial(_taken, objective), _refused, s, at, value)
-    return _either((s.share == 1) & ~s.done, partial(_directed, objective, tolerance), lambda s: s, s)
+    s = branch(better | (s.taken == 0), partial(_taken, objective), _refused, s, at, value)
+    return branch((s.share == 1) & ~s.done, partial(_directed, objective, tolerance), lambda s: s, s)
 
 
 def climb_on_host(
@@ -132,10 +132,23 @@ def grown(damping: Any) -> Any:
     return library(damping).maximum(10.0 * damping, 1e-3)
 
 
-def _either(condition: Any, yes: Callable[..., Search], no: Callable[..., Search], *given: Any) -> Search:
+def branch(condition: Any, yes: Callable[..., Any], no: Callable[..., Any], *given: Any) -> Any:
+    """One branch or the other, by a `cond` where the condition is traced."""
     if library(condition) is np:
         return (yes if condition else no)(*given)
     return jax.lax.cond(condition, yes, no, *given)
+
+
+def until_over(step: Callable[[Any], Any], state: Any) -> Any:
+    """The state after steps until it is `over`, by a `while_loop` where it is traced.
+
+    The host calls kernels that other parts of a fit use too.
+    """
+    if library(*jax.tree.leaves(state)) is not np:
+        return jax.lax.while_loop(lambda state: ~state.over, step, state)
+    while not state.over:
+        state = step(state)
+    return state
 
 
 def _taken(objective: Objective, s: Search, at: Any, value: Any) -> Search:

@@ -67,11 +67,6 @@ def _climb(
     return mode, eliminate(model, mode.point, expected=True)
 
 
-@jax.jit
-def _eliminated(model: Model, point: Point) -> Eliminated:
-    return eliminate(model, point, expected=True)
-
-
 def _iterate(model: Model, prior: Prior, given: Given, state: State, rule: str, trajectory: str) -> State:
     """New precisions and levels, then the mode and the evidence at that mode: all of one state belongs together."""
     model, state = learnt(model, prior, given, state, rule)
@@ -263,7 +258,7 @@ class EA(Maximiser):
         With noise that is not Gaussian steps have other weights, and unknown levels change the system in between.
         """
         same = model.weighs_as_expected and not model.learns_noise
-        return _eliminated(model, start) if self.trajectory == "joint" and same else ()
+        return eliminate(model, start, expected=True) if self.trajectory == "joint" and same else ()
 
     def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """Mode, evidence, new precisions."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from probcal import linalg
 from probcal.gaussian import recursion as rec
-from probcal.gaussian.mode import Point, apart, cost, factors, smooth_tracks
+from probcal.gaussian.mode import Point, apart, cost, factors, gains_of, smooth_tracks
 from probcal.model import rows as waist
 from probcal.model import variants
 from probcal.model.model import At, Model, Recursion
@@ -235,21 +235,22 @@ def known_places(problem: Problem, r: int, span: tuple[int, int]) -> tuple[np.nd
 
 
 @jax.jit
-def _consistent(
-    part: Recursion, states: jax.Array, weight: jax.Array, levels: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Smooth pseudo-measured states (E, n) of precision `weight` (E, n) into a trajectory of the motion model."""
-    L = factors(part, levels)
-    J = jax.vmap(jnp.diag)(weight)
-    gain = rec.gains(part.F, L, J, tuple(range(J.shape[-1])))
-    smooth = rec.smooth(part.F, gain, (weight * states)[:, :, None], part.drift[:, :, None])
+def _smoothed(part: Recursion, gain: rec.Gains, pull: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """States and whitened noises (E, n) of data compressed to a pull (E, n) on the states."""
+    smooth = rec.smooth(part.F, gain, pull[:, :, None], part.drift[:, :, None])
     return smooth.states[:, :, 0], smooth.noises[:, :, 0]
 
 
 def project(problem: Problem, tracks: list[np.ndarray], precision: list[np.ndarray]) -> Point:
     """Point at zero biases whose trajectories follow given states (E, n) with given precisions (E, n)."""
     levels: Any = np.zeros(len(problem.levels))
-    pairs = problem.model.each(lambda *own: _consistent(*own, levels), tracks, precision)
+
+    def consistent(part: Recursion, states: np.ndarray, weight: np.ndarray) -> tuple[jax.Array, jax.Array]:
+        told = tuple(np.flatnonzero(weight.any(0)).tolist())
+        gain = gains_of(part, levels, weight[:, :, None] * np.eye(weight.shape[1]), told)
+        return _smoothed(part, gain, weight * states)
+
+    pairs = problem.model.each(consistent, tracks, precision)
     return Point(Trajectories.of(pairs), *jax.device_put((np.zeros(problem.model.biases), levels)))
 
 
