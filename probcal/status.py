@@ -286,7 +286,7 @@ FOUND = (  # of an answer that is looked at again; a fact may hold several times
     Rule(
         "clocks",
         Status.NOT_CONVERGED,
-        "The times of the rows have not converged: {clocks} still moves from round to round.",
+        "The times of the rows have not converged: from round to round there still moves {clocks}.",
     ),
     Rule("unseen", Status.NOT_CONVERGED, "{unseen} while other answers were looked for."),
     Rule("interrupted", Status.NOT_CONVERGED, ""),

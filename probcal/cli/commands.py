@@ -92,7 +92,7 @@ def fit_command(
     limit: Annotated[
         float | None,
         typer.Option(
-            help="s after which the search for other answers ends; checks follow",
+            help="s after which a fit and the search for other answers end; checks follow",
             show_default=False,
         ),
     ] = None,

@@ -435,7 +435,7 @@ def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -
 
         bound = jnp.where(s.moving, s.costs, jnp.inf)
         shares, after = halved(lambda shares: costs(taken(shares)), bound)
-        stuck, gain = shares == 0, jnp.where(s.moving, s.costs - after, 0.0)
+        stuck, gain = s.moving & (shares == 0), jnp.where(s.moving, s.costs - after, 0.0)
         moving = s.moving & jnp.where(stuck, ~s.renew, gain >= tolerance)
         waits, most = jnp.any(stuck), jnp.max(gain)
         return _Tracking(

@@ -156,7 +156,7 @@ def _taken(objective: Objective, s: Search, at: Any, value: Any) -> Search:
     xp, slope = library(s.share), objective.slope(at)
     move, change = xp.asarray(at.point.z) - xp.asarray(s.at.point.z), s.slope - slope
     before = s.share * (move @ s.slope) - s.damping * (move @ move)  # of the curvature so far, along the move
-    curved = (s.taken > 0) & (move @ change > LEAST_CURVED * before)
+    curved = (s.taken > 0) & (move @ change > LEAST_CURVED * xp.maximum(before, 0.0))
     moves, changes = (
         xp.where(curved, xp.concatenate([kept[1:], own[None]]), kept)
         for kept, own in ((s.moves, move), (s.changes, change))
@@ -249,3 +249,9 @@ def halved(value: Callable[[jax.Array], jax.Array], bound: jax.Array) -> tuple[j
 def between(a: Any, b: Any, share: Any) -> Any:
     """The pytree a + share (b - a), a itself where the share is 0, whatever b is."""
     return jax.tree.map(lambda p, q: jnp.where(share == 0, p, p + share * (q - p)), a, b)
+
+
+@jax.jit
+def chosen(first: jax.Array, one: Any, other: Any) -> Any:
+    """One pytree or the other."""
+    return jax.tree.map(lambda a, b: jnp.where(first, a, b), one, other)

@@ -136,6 +136,7 @@ class HostClimb(Task):
         if state.over:
             at = self.at(state)
             model, start = renewed_noise(model, at.point, Variances.of(at, self.factors))
+            del at
         elif state.search.taken:
             search = state.search._replace(at=self.at(state))
         self.here = None  # it may be large

@@ -84,7 +84,7 @@ def _directions(answer: Answer) -> tuple[tuple[Direction, ...], int]:
 
 
 def judged_problem(problem: Problem, answer: Answer) -> Problem | None:
-    """The problem by which the tree of an answer is judged, its rows named; None where no motion has a linear form."""
+    """The problem by which the tree of an answer is judged, its rows named; None where a motion has no linear form."""
     if not linear_form(answer):
         return None
     return problem if problem.scans is None else answer.problem

@@ -22,6 +22,7 @@ from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
 from probcal.gaussian.marginal import volume_slope
 from probcal.gaussian.mode import Eliminated, Point, smooth_tracks
+from probcal.gaussian.search import chosen
 from probcal.inference.gibbs import gibbs_sweep
 from probcal.inference.hierarchy import Phi
 from probcal.inference.method import Context
@@ -153,7 +154,6 @@ def by_propagation(
     work = Propagation.of(form, first, known, blocks_of(at.model), context.key)
     work.resume(context.run(work)[0])
     swept, here = work.swept, work.likelihood.here
-    assert swept is not None
     z, covariance = joint_draws(work)
     lower, upper = interval(swept.means, swept.sds)
     total = Moments(work.mean, covariance, lower, upper, swept.gamma)
@@ -167,7 +167,6 @@ def joint_draws(work: Propagation) -> tuple[np.ndarray, SensorBlocks]:
     They are ordered as those of the Gaussian of likelihood and sites are (Iman and Conover 1982).
     """
     swept, factors, here = work.swept, work.factors, work.likelihood.here
-    assert swept is not None
     M, whole = work.form.biases, work.likelihood.whole
     shape = (CHAINS, KEPT if whole else few_draws(M))
     count, rng = shape[0] * shape[1], np.random.default_rng(np.asarray(jax.random.key_data(work.key)))
@@ -211,12 +210,6 @@ def recentred(how: Integration, model: Model, point: Point, known: Natural, mean
     moved = point_at(model, point, mean)
     after, sound = likelihood(how, model, known.first, moved)
     return chosen(sound, (moved, after), (point, known))
-
-
-@jax.jit
-def chosen(first: jax.Array, one: Any, other: Any) -> Any:
-    """One pytree or the other."""
-    return jax.tree.map(lambda a, b: jnp.where(first, a, b), one, other)
 
 
 @partial(jax.jit, static_argnames="form")

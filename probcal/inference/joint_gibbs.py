@@ -91,10 +91,11 @@ class Gibbs(Sampler):
     Hamiltonian quarter turn about its mean, which splits off the Gaussian (Shahbaba and others
     2014): an independent draw where the model is linear, elsewhere kicked as often as it takes to be
     accepted. Any prior with a density.
-    Of more than four million numbers no draws of states are kept, their means and sds are. Chains run one after the
-    other and start at draws under the declared scales, on the side of a mirror that fits best; they do not visit the
-    others, which the answer names. Draws that have not mixed are made anew with 4 times as many sweeps from one to the
-    next, up to `patience`. Raises `InputError` for less than one chain or draw.
+    Of more than four million numbers no draws of states are kept, their means and sds are. Chains
+    run one after the other; biases and tracks start at draws under the declared scales, on the side
+    of a mirror that fits best. They do not visit the others, which the answer names. Draws that
+    have not mixed are made anew with 4 times as many sweeps from one to the next, up to `patience`.
+    Raises `InputError` for less than one chain or draw.
     """
 
     chains: int = 4

@@ -62,19 +62,19 @@ class Task(ABC):
 def run(task: Task, monitor: Monitor, storage: Storage | None = None) -> tuple[Any, Trace]:
     """Run a task until it has ended, is spent or stopped: its last state and its course.
 
-    A storage keeps state and course on the way; what it holds of this loop is gone on with. Once the call is stopped
-    nothing further is kept, since what follows is not what an uninterrupted run does.
+    A storage keeps state and course on the way; what it holds of this loop is gone on with. Of a loop that begins when
+    the call is stopped nothing is written, since it is not what an uninterrupted run does.
     """
     state, moved = task.init(), False
     trace = Trace(np.zeros(0), *np.zeros((2, 0, task.biases)))
-    kept = None if storage is None or monitor.stopped else storage.checkpoint(arrays_of(state))
+    kept, late = None if storage is None else storage.checkpoint(arrays_of(state)), bool(monitor.stopped)
 
     def tell(done: int, objective: float) -> None:
         monitor.tell(task.name, min(done, task.iterations), task.iterations, objective, bound=True)
 
     def pause(done: int, objective: float) -> bool:
         tell(done, objective)
-        return bool(monitor.stopped) or (kept is not None and kept.due)
+        return bool(monitor.stopped) or (kept is not None and not late and kept.due)
 
     if kept is not None and kept.found is not None:
         state, trace, moved = like(state, kept.found[0]), Trace(*kept.found[1]), True
@@ -85,9 +85,9 @@ def run(task: Task, monitor: Monitor, storage: Storage | None = None) -> tuple[A
             break
         state, course = task.step(state, done, pause)
         trace, moved = trace.and_then(course), True
-        if kept is not None and kept.due:
+        if kept is not None and not late and kept.due:
             kept.write(arrays_of(state), trace)
-    if kept is not None:
+    if kept is not None and not late:
         kept.write(arrays_of(state), trace)
     return state, trace
 
@@ -111,4 +111,4 @@ def like(state: Any, leaves: Sequence[np.ndarray]) -> Any:
         return jnp.asarray(stored) if isinstance(own, jax.Array) else stored
 
     own, form = jax.tree.flatten(state)
-    return jax.tree.unflatten(form, map(restored, leaves, own))
+    return jax.tree.unflatten(form, [restored(*pair) for pair in zip(leaves, own, strict=True)])

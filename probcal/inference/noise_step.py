@@ -57,8 +57,11 @@ def draw_noise(model: Model, point: Point, key: jax.Array, alone: tuple[int, ...
 def _with_levels(model: Model, point: Point, together: jax.Array, key: jax.Array, alone: tuple[int, ...]) -> Point:
     """The point at levels drawn anew: of std together at given states, then some one by one."""
 
+    held = np.isin(np.arange(point.levels.shape[0]), list(_parameters(model)))
+
     def by_level(levels: jax.Array) -> jax.Array:
         """Log density (H,) of each level at the states, of data and noises that it multiplies."""
+        levels = jnp.where(held, point.levels, levels)  # families keep their parameters
         found = model.by_level(model.log_likelihood(At(point.states, point.z, levels)))
         padded = jnp.append(levels, 0.0)
         for part, u in model.each_layout(at_levels(model, point, levels).noises):
@@ -69,7 +72,6 @@ def _with_levels(model: Model, point: Point, together: jax.Array, key: jax.Array
                 found = found.at[part.level[:, tail.columns[0]]].add(gain)
         return found[:-1] + log_prior_levels(model, levels)
 
-    held = np.isin(np.arange(point.levels.shape[0]), list(_parameters(model)))
     levels = jnp.where(held, point.levels, slice_step(together, point.levels, by_level))
     point = at_levels(model, point, levels)
 

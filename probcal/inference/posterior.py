@@ -99,7 +99,8 @@ def conclude_draws(
     mixed = mixing(within_sides(np.asarray(run.draws.theta), run.side))
     posterior = posterior_of(problem, prior, run, mixed)
     unexplained = (misfit or _misfit)(problem, posterior.point)
-    status, message = judge(CHAINS, facts_of(problem, prior, run, mixed) | facts | {"misfit": unexplained})
+    known = facts_of(problem, run, mixed) | ({} if unexplained else _steps(problem, prior, run))
+    status, message = judge(CHAINS, known | facts | {"misfit": unexplained})
     ended = bias_status(problem, {"not mixed": mixed["r_hat"][: run.form.biases] > 1.05} if "r_hat" in mixed else {})
     return Answer(
         problem, run.method, run.asked, prior, posterior, status, message, ended, run.z.shape[1],
@@ -185,7 +186,7 @@ def _stats(run: SamplerRun) -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in run.draws.stats.items()}
 
 
-def facts_of(problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def facts_of(problem: Problem, run: SamplerRun, mixed: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """The facts that a run says of its draws, in the names of `probcal.status.CHAINS`."""
     draws, names = run.z.shape[1], [*problem.labels, *(level.label for level in problem.levels)]
     facts: dict[str, Any] = {"note": run.note} | mixed_of(names, mixed, run.z.shape[0])
@@ -198,12 +199,7 @@ def facts_of(problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str
         listed = ", ".join(f"{share[k]:.2f} ± {error[k]:.2f}" for k in np.flatnonzero(share))
         facts["sides"] = np.count_nonzero(share), listed
         facts["unsure"] = error.max() > UNSURE
-    facts |= _steps(run)
-    if not run.method.exact:
-        khat = pareto_khat(_stats(run)["log_weight"].ravel())
-        facts["fitting" if khat < K_HAT else "unfitting"] = khat, K_HAT
-    away = np.abs(run.z.mean((0, 1))[~problem.surveyed])
-    return facts | {"far": isinstance(prior, Flat) and (away > FAR).any()}
+    return facts
 
 
 def mixed_of(names: Sequence[str], mixed: Mapping[str, np.ndarray], chains: int, limit: Any = R_HAT) -> dict[str, Any]:
@@ -217,9 +213,14 @@ def mixed_of(names: Sequence[str], mixed: Mapping[str, np.ndarray], chains: int,
     return facts
 
 
-def _steps(run: SamplerRun) -> dict[str, Any]:
-    """What the steps of NUTS or of the Metropolis correction say that hurts."""
+def _steps(problem: Problem, prior: Prior, run: SamplerRun) -> dict[str, Any]:
+    """Facts of the steps of a sampler or of a guide; a misfit says none of them."""
     found, facts = _stats(run), dict[str, Any]()
+    if not run.method.exact:
+        khat = pareto_khat(found["log_weight"].ravel())
+        facts["fitting" if khat < K_HAT else "unfitting"] = khat, K_HAT
+    away = np.abs(run.z.mean((0, 1))[~problem.surveyed])
+    facts["far"] = isinstance(prior, Flat) and (away > FAR).any()
     if "diverging" in found and found["diverging"].any():
         facts["divergences"] = int(found["diverging"].sum())
         facts["or"] = ", or take collapsed" if run.asked is run.method else ""

@@ -22,6 +22,7 @@ from probcal.gaussian.engine import Engine, Factors
 from probcal.gaussian.information import mean_square
 from probcal.gaussian.linearised import LaplaceApproximation, laplace
 from probcal.gaussian.mode import Point
+from probcal.gaussian.search import chosen
 from probcal.gaussian.tails import Variances, renewed_noise
 from probcal.inference.ending import FAR, conclude
 from probcal.inference.engined import climb_on
@@ -272,14 +273,8 @@ def renew_noise(model: Model, state: State, covariance: jax.Array, fresh: Any = 
     if not model.learns_noise:
         return model, state
     after, point = renewed_noise(model, state.point, Variances.dense(model, state.point, covariance))
-    point, mixing = unless(fresh, (point, after.mixing), (state.point, state.mixing))
+    point, mixing = chosen(fresh, (state.point, state.mixing), (point, after.mixing))
     return model.with_mixing(mixing), state._replace(point=point, mixing=mixing)
-
-
-@jax.jit
-def unless(fresh: Any, new: Any, old: Any) -> Any:
-    """A pytree as it was where the state is fresh, else the new one."""
-    return jax.tree.map(lambda new, old: jnp.where(fresh, old, new), new, old)
 
 
 def learn(prior: Prior, given: Given, alpha: jax.Array, gamma: Any, variance: Any, z: jax.Array, rule: str) -> Any:

@@ -45,6 +45,7 @@ from probcal.inference.manifest import (
 
 Arrays = Mapping[str, Any]
 EVERY = 2.0  # s from one state of a climb that is written to the next
+SELDOM = 20.0  # times what a write took, until the next one at least
 
 
 class Storage:
@@ -218,7 +219,7 @@ class Checkpoint:
     """
 
     def __init__(self, storage: Storage, number: int, first: Sequence[Any]):
-        self.storage, self.number, self.written = storage, number, time.monotonic()
+        self.storage, self.number, self.later = storage, number, time.monotonic() + EVERY
         self.begun = np.array(hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in first)).hexdigest())
         self.found: tuple[list[np.ndarray], list[np.ndarray]] | None = None  # leaves of the state; the course
         if number in storage.numbers and (part := storage.read(number))["begun"] == self.begun:
@@ -227,15 +228,17 @@ class Checkpoint:
     @property
     def due(self) -> bool:
         """True where the state has not been written for some time."""
-        return time.monotonic() - self.written >= EVERY
+        return time.monotonic() >= self.later
 
     def write(self, state: Sequence[Any], course: Sequence[Any]) -> None:
         """Replace the part."""
+        before = time.monotonic()
         named = {
             f"{kind}_{k}": leaf for kind, own in (("state", state), ("course", course)) for k, leaf in enumerate(own)
         }
         self.storage.add(self.number, named | {"begun": self.begun})
-        self.written = time.monotonic()
+        now = time.monotonic()
+        self.later = now + max(EVERY, SELDOM * (now - before))
 
 
 class Records:

@@ -82,7 +82,7 @@ class SideClimb(NamedTuple):
             try:
                 found = climb_to_mode(lambda at: engine.settled(model, at), point, factors, CLIMB, 1e-3)
                 value = evidence(found.at, scales, factors).value if engine.exact else -found.value
-            except (np.linalg.LinAlgError, FitError):  # not positive definite, or conjugate gradients did not end
+            except (np.linalg.LinAlgError, FitError):  # no evidence there, or conjugate gradients did not end
                 return point, -np.inf
             return found.at.point, value
 

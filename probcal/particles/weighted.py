@@ -325,7 +325,7 @@ def conclude_particles(
     left, asked = notable_scatter(posterior.problem, posterior.point), method.tolerance == 0
     worths, count = ended.trace.objective, ended.trace.iterations
     answer = conclude_at(
-        posterior.problem, method, prior, posterior, worths, np.nan, count, converged=ended.still,
+        posterior.problem, method, prior, posterior, worths, np.nan, count, converged=ended.still and not stopped,
         evidence=told.log_likelihood, stopped=ended.stopped,
         misfit=unexplained(posterior.problem, posterior.point),
         left=0.0 if stopped else left, ahead=ahead if ahead > AHEAD and not stopped else 0.0,
@@ -337,7 +337,7 @@ def conclude_particles(
 
 
 def steepness(slope: np.ndarray, covariance: np.ndarray, noise: np.ndarray) -> float:
-    """How far a Newton step would go in sd a bias, less the noise of the slope: on average, or half the largest."""
+    """How far a Newton step would go in sd per bias, less the noise of the slope: on average, or half the largest."""
     if not len(slope):
         return 0.0
     step, sd = covariance @ slope, np.sqrt(np.maximum(np.diag(covariance), 1e-300))
