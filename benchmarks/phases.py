@@ -59,12 +59,12 @@ WRAPPED = (  # module, function, phase within it, phase after it
     ("probcal.cli.fit", "load_truth", "table", ""),
     ("probcal.cli.fit", "calibrated", "", "report"),
     ("probcal.inference.fit", "solve", "", "other"),
-    ("probcal.inference.fit", "weak_directions", "directions", ""),
-    ("probcal.inference.fit", "runs", "directions", ""),
-    ("probcal.inference.fit", "strained_starts", "directions", ""),
-    ("probcal.inference.fit", "build", "draws", ""),
+    ("probcal.inference.finish", "weak_directions", "directions", ""),
+    ("probcal.inference.finish", "runs", "directions", ""),
+    ("probcal.inference.finish", "strained_starts", "directions", ""),
+    ("probcal.inference.finish", "build", "draws", ""),
     ("probcal.inference.run", "integrate", "precisions", ""),
-    ("probcal.inference.propagate", "Propagation.run", "precisions", ""),
+    ("probcal.inference.propagate", "Propagation.step", "precisions", ""),
 )
 HEAD = ("fit", "all", *PHASES, *WORK.values(), RUNNING, "kernels", "HLO", "GB", "fit.nc, MB", "exit")
 

@@ -150,6 +150,7 @@ class Problem:
         self.motion = {str(name): value for name, value in motion.items()} if isinstance(motion, Mapping) else motion
         self.fixed = fixed_biases(network, fix)
         self.biases: tuple[BiasRecord, ...] = tuple(b for b in network.biases if b.label not in self.fixed)
+        self.labels = tuple(bias.label for bias in self.biases)  # in the order of every bias array
         self.scales = np.array([bias.scale for bias in self.biases])
         self.surveyed = np.array([bias.kind != "scale" for bias in self.biases], bool)
         self.epoch = _positive(epoch)
@@ -168,11 +169,6 @@ class Problem:
     def _at_epochs(self, data: Measurements) -> Measurements:
         """Rows at common epochs, where these are asked for."""
         return data if self.epoch is None else replace(data, time=np.round(data.time / self.epoch) * self.epoch)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Labels of the free biases, in the order of every bias array."""
-        return tuple(bias.label for bias in self.biases)
 
     @property
     def targets(self) -> tuple[str, ...]:

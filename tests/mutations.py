@@ -85,7 +85,6 @@ MUTATIONS = [
     Mutation("information + linalg.gram_less(new, alone)", "information + linalg.gram(new)", "test_exact.py"),
     Mutation("0.5 * known + widening(model, point.levels)", "0.5 * known", "test_formulas.py"),
     Mutation("return proposal, 0.5 * slope", "return proposal, slope", "test_guards.py"),
-    Mutation("BROUGHT * shares * promised, bound", "0.0 * shares * promised, bound", "test_marginal.py"),
     Mutation("~moved & ~converged", "moved & ~converged", "test_guards.py"),
     # gaussian/marginal.py
     Mutation("slope = own + jax.grad(along)(point.z)", "slope = own", "test_marginal.py"),

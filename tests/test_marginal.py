@@ -17,9 +17,9 @@ from probcal.errors import InputError
 from probcal.gaussian.climb import find_marginal_mode
 from probcal.gaussian.linearised import laplace
 from probcal.gaussian.marginal import volume_slope
-from probcal.gaussian.mode import SETTLED, TRACK_STEPS, Point, cost, eliminate, find_mode, find_tracks
+from probcal.gaussian.mode import Point, cost, eliminate, find_mode
 from probcal.gaussian.search import between, climb_on_host, climb_traced, halved
-from probcal.geometry import bearing, norm
+from probcal.geometry import bearing
 from probcal.linalg import library
 from probcal.modes import automatic_start
 from probcal.priors import Precision
@@ -77,29 +77,6 @@ def test_on_a_linear_problem_it_is_the_joint_mode():
     assert bool(marginal.converged)
     np.testing.assert_allclose(marginal.point.z, joint.point.z, atol=1e-7)
     assert float(evidence) == pytest.approx(float(again), abs=1e-8)
-
-
-def test_tracks_far_from_their_mode_settle():
-    """Ranges of 5 cm whose offsets are a metre off: a step of a track that brings little of its promise is halved."""
-    places = {"a": (0.0, 0.0), "b": (9.0, 1.0), "c": (4.0, 8.0), "d": (12.0, 9.0)}
-
-    @sensor(range=Channel("m", std=0.05))
-    def ranger(target, pose, *, range_offset=probcal.Bias("m", 1.0)):
-        return dict(range=norm(target.position - pose.position) + range_offset)
-
-    network = Network([ranger.on(Node(name, at, scale=0.5)) for name, at in places.items()])
-    draw, times, motion = np.random.default_rng(0), np.arange(12.0), ConstantVelocity(0.2)
-    tracks = {f"t{k}": draw.uniform(0, 10, 2) + draw.normal(0, 0.6, (12, 2)).cumsum(0) for k in range(12)}
-    problem = Problem(network, motion, simulate(network, motion, times, key=1, tracks=tracks).table)
-    with jax.enable_x64(True):
-        model, start = problem.model, automatic_start(problem)
-        flat, left = Precision(jnp.zeros(model.biases)), []
-        for k in range(5):
-            far = start._replace(z=jnp.asarray(np.random.default_rng(k).normal(0, 1, model.biases)))
-            here = find_tracks(model, far, TRACK_STEPS, SETTLED)
-            end = find_tracks(model, find_tracks(model, here, 400, 1e-13), 400, 1e-13)
-            left.append(float(cost(model, here, flat) - cost(model, end, flat)))
-    assert np.median(left) < 1e-6
 
 
 def test_steps_are_halved_apart_and_none_is_taken_where_none_would_do():

@@ -14,7 +14,7 @@ from contracts import only
 
 import probcal
 from probcal import ConstantVelocity, Network, Node, Target
-from probcal.gaussian.linearised import compress_and_eliminate
+from probcal.gaussian.mode import compress_rows
 
 SCRIPT = """
 import json
@@ -168,13 +168,13 @@ def test_results_carry_more_digits_than_float32(processes):
 def test_other_data_of_the_same_shape_compile_nothing(kept_kernels):
     """A kernel takes data as arguments: new numbers, and a network of the same form, reuse every trace."""
     _, first = fitted(table())
-    traces = compress_and_eliminate._cache_size()
+    traces = compress_rows._cache_size()
     assert traces > 0
     with pytest.raises(AssertionError, match="compilations"), NoCompile():
         jax.jit(lambda x: x + traces)(1.0)
     with NoCompile():
         _, second = fitted(table(1))
-    assert compress_and_eliminate._cache_size() == traces
+    assert compress_rows._cache_size() == traces
     assert not np.allclose(first["calibration"]["mean"], second["calibration"]["mean"])
 
 

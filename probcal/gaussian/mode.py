@@ -23,7 +23,6 @@ from probcal.model.trajectories import Trajectories
 from probcal.priors import Precision
 
 CHORD = 0.1  # share of the last gain up to which what was eliminated serves on
-BROUGHT = 0.5  # share of the promised fall that a step of a track must bring, as any part of one does on a quadratic
 TRACK_STEPS = 30  # of tracks at held biases
 SETTLED = 1e-10  # nats at which they end: log det W moves with the trajectories to first order
 apart = jax.lax.optimization_barrier  # keeps XLA from weaving two computations together, or doing one of them twice
@@ -405,8 +404,8 @@ def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -
     """Trajectories at held biases until the cost of each changes by less than `tolerance`: iterated EKS by chords.
 
     What was eliminated serves the next steps too while each gains a tenth of the one before or less (Kelley 1995, 5.4):
-    they need the score alone. Each track halves a step until it brings enough, so that none waits for another; one that
-    no part of a step improves stays where it is: on a cusp, where it grazes a sensor.
+    they need the score alone. Each track halves a step by itself, so that none waits for another; one that no part of a
+    step improves stays where it is: on a cusp, where it grazes a sensor.
     """
     still = jnp.zeros_like(start.z)
     score = jax.grad(lambda states, at: log_likelihood(model, At(states, at.z, at.levels)))
@@ -434,15 +433,9 @@ def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -
         def taken(shares: jax.Array) -> Point:
             return part_way(s.point, full, jnp.where(s.moving, shares, 0.0))
 
-        steps = jax.tree.map(jnp.subtract, full.trajectories, s.point.trajectories)
-        slopes = model.each(
-            lambda _, pull, dx, u, du: jnp.sum(pull * dx - u * du, 1), pulls, steps.states, s.point.noises, steps.noises
-        )
-        promised = 0.5 * jnp.maximum(jnp.concatenate(model.by_target(slopes)), 0.0)
         bound = jnp.where(s.moving, s.costs, jnp.inf)
-        shares, value = halved(lambda shares: costs(taken(shares)) + BROUGHT * shares * promised, bound)
-        stuck, after = s.moving & (shares == 0), value - BROUGHT * shares * promised
-        gain = jnp.where(s.moving, s.costs - after, 0.0)
+        shares, after = halved(lambda shares: costs(taken(shares)), bound)
+        stuck, gain = s.moving & (shares == 0), jnp.where(s.moving, s.costs - after, 0.0)
         moving = s.moving & jnp.where(stuck, ~s.renew, gain >= tolerance)
         waits, most = jnp.any(stuck), jnp.max(gain)
         return _Tracking(

@@ -82,6 +82,7 @@ def search_step(objective: Objective, s: Search, at: Any, tolerance: Any) -> Sea
     return branch((s.share == 1) & ~s.done, partial(_directed, objective, tolerance), lambda s: s, s)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a number that is not finite is no better one
 def climb_on_host(
     objective: Objective, start: Any, biases: int, iterations: int, tolerance: float,
     told: Callable[[int, float], bool] | None = None, search: Search | None = None,
