@@ -11,7 +11,7 @@ from probcal import NUTS, SVI, Gaussian, Horseshoe, InputError
 from probcal.gaussian.mode import smooth_tracks
 from probcal.inference.guides import GuideParameters, Structured
 from probcal.inference.pose import pareto_khat
-from probcal.inference.posterior import steps_of
+from probcal.inference.posterior import facts_of_steps
 from probcal.inference.progress import Monitor
 from probcal.inference.sampling import sample
 from probcal.modes import automatic_start
@@ -75,7 +75,7 @@ def test_a_guide_that_does_not_fit_has_not_converged(khat, status, monkeypatch):
     monkeypatch.setattr("probcal.inference.posterior.pareto_khat", lambda _: khat)
     run, _ = solved("plane", SVI(chains=2, warmup=50, draws=1000), Gaussian())
     problem = linear("plane")[0]
-    ended, message = judge(CHAINS, steps_of(problem, Gaussian(), run))
+    ended, message = judge(CHAINS, facts_of_steps(problem, Gaussian(), run))
     assert str(ended) == status
     assert ("it stands for the posterior" in message) == (status == "converged")
     assert ("it does not fit the posterior; fit with NUTS() or Collapsed()" in message) == (status != "converged")

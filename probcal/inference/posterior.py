@@ -99,7 +99,7 @@ def conclude_draws(
     mixed = mixing(within_sides(np.asarray(run.draws.theta), run.side))
     posterior = posterior_of(problem, prior, run, mixed)
     unexplained = (misfit or _misfit)(problem, posterior.point)
-    known = facts_of(problem, run, mixed) | ({} if unexplained else steps_of(problem, prior, run))
+    known = facts_of(problem, run, mixed) | ({} if unexplained else facts_of_steps(problem, prior, run))
     status, message = judge(CHAINS, known | facts | {"misfit": unexplained})
     ended = bias_status(problem, {"not mixed": mixed["r_hat"][: run.form.biases] > 1.05} if "r_hat" in mixed else {})
     return Answer(
@@ -213,7 +213,7 @@ def mixed_of(names: Sequence[str], mixed: Mapping[str, np.ndarray], chains: int,
     return facts
 
 
-def steps_of(problem: Problem, prior: Prior, run: SamplerRun) -> dict[str, Any]:
+def facts_of_steps(problem: Problem, prior: Prior, run: SamplerRun) -> dict[str, Any]:
     """Facts of the steps of a sampler or of a guide; a misfit says none of them."""
     found, facts = _stats(run), dict[str, Any]()
     if not run.method.exact:
