@@ -361,15 +361,15 @@ class Naive:
         total = sum(part.drift.size for part in model.recursions)
         for part in model.recursions:
             E, n = part.drift.shape
-            own, L = np.zeros((E, n, total)), np.asarray(factors(part, point.levels))
+            own, F, L = np.zeros((E, n, total)), np.asarray(part.F), np.asarray(factors(part, point.levels))
             for e in range(E):
-                own[e] = np.asarray(part.F[e]) @ own[e - 1]
+                own[e] = F[e] @ own[e - 1]
                 own[e, :, start + e * n : start + (e + 1) * n] += L[e]
             self.maps.append(own)
             start += E * n
         self.U, self.u = total, np.concatenate([np.asarray(u).ravel() for u in point.noises])
         H, w, s = self.H, self.w, self.s = [], [], []
-        for block, data, r, lin in zip(model.blocks, model.rows, model.recursion, rows, strict=True):
+        for block, data, r, lin in zip(model.blocks, *jax.device_get((model.rows, model.recursion, rows)), strict=True):
             for k in range(len(data.epoch)):
                 for c in range(data.y.shape[1]):
                     row = np.zeros(total + self.M + 1)

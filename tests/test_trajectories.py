@@ -69,7 +69,7 @@ def test_sums_by_target_are_those_of_loops(name):
     sums = model.by_target(point.states)
     for r, part in enumerate(model.recursions):
         for t in range(model.targets[r]):
-            whole = sum(np.asarray(x) for x, k in zip(point.states[r], part.target, strict=True) if k == t)
+            whole = np.asarray(point.states[r])[np.asarray(part.target) == t].sum(0)
             np.testing.assert_allclose(sums[r][t], whole, rtol=1e-12)
 
 
@@ -80,8 +80,9 @@ def test_states_are_those_that_noises_drive_one_epoch_after_the_other(name):
     noises = drawn(problem).noises
     for part, u, states in model.each_layout(noises, model.each(lambda p, u: driven_states(p, levels, u), noises)):
         x, scale = np.zeros(u.shape[1]), np.append(np.exp(levels), 1.0)[np.asarray(part.level)]
+        F, drift, L, u = (np.asarray(own) for own in (part.F, part.drift, part.L, u))
         for e in range(len(u)):
-            x = part.F[e] @ x + part.drift[e] + part.L[e] @ (scale[e] * u[e])
+            x = F[e] @ x + drift[e] + L[e] @ (scale[e] * u[e])
             np.testing.assert_allclose(states[e], x, rtol=1e-9, atol=1e-9 * np.abs(x).max())
 
 

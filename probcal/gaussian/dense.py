@@ -133,10 +133,9 @@ class DenseExpansion:
             self._kept[:] = [factors, precision, jax.device_put(0.5 * (inverse + inverse.T))]
         return self._kept[2]
 
-    def marginals(self, factors: Factors, members: np.ndarray) -> jax.Array:
+    def marginals(self, factors: Factors, members: np.ndarray) -> np.ndarray:
         """Covariances (B, p, p) of biases (B, p), M of none: 1 on its diagonal."""
-        M = self.model.biases
-        whole = jnp.zeros((M + 1, M + 1)).at[:M, :M].set(self.covariance(factors))
+        whole, M = np.pad(np.asarray(self.covariance(factors)), (0, 1)), self.model.biases
         none = (members == M)[:, :, None] * np.eye(members.shape[1])[None]
         return whole[members[:, :, None], members[:, None, :]] + none
 

@@ -32,7 +32,7 @@ class JointDraws(NamedTuple):
 
 def many_data(model: Model) -> bool:
     """Whether data are too many for a value of each and of each draw to be kept."""
-    return sum(int(mask.sum()) for mask in model.measured) > LARGE
+    return sum(int(np.asarray(mask).sum()) for mask in model.measured) > LARGE
 
 
 def draws_a_chain(data: int, chains: int) -> int:

@@ -170,7 +170,7 @@ class Expansion(Protocol):
     def moved(self, dz: Any) -> Point:
         """The point with the biases moved by dz (M,), all tracks following."""
 
-    def marginals(self, factors: Factors, members: np.ndarray) -> Any:
+    def marginals(self, factors: Factors, members: np.ndarray) -> np.ndarray:
         """Covariances (B, p, p) of biases (B, p), M of none: 1 on its diagonal."""
 
     def spread(self, factors: Factors) -> Spread:

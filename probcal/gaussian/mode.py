@@ -89,6 +89,7 @@ class Kept(NamedTuple):
     gain: rec.Gains
 
 
+@partial(jax.jit, inline=True)  # one kernel where it stands alone
 def factors(part: Recursion, levels: jax.Array) -> jax.Array:
     """Noise factors with the estimated levels, and the precisions of noise that is not Gaussian, (E, n, n)."""
     scale = jnp.concatenate([jnp.exp(levels), jnp.ones(1, levels.dtype)])[part.level]
@@ -96,12 +97,14 @@ def factors(part: Recursion, levels: jax.Array) -> jax.Array:
     return part.L * scale[:, None, :]
 
 
+@partial(jax.jit, inline=True)
 def inverse_factors(part: Recursion, levels: jax.Array) -> jax.Array:
     """Pseudo-inverse (E, n, n) of the noise factors at log levels (H,): 0 where no noise drives."""
     L = factors(part, levels)
     return jax.vmap(linalg.regress_rows, (None, 0))(jnp.eye(L.shape[1]), L)
 
 
+@partial(jax.jit, inline=True)
 def noises_of(part: Recursion, levels: jax.Array, states: jax.Array) -> jax.Array:
     """The shortest whitened noises (E, n) that drive states (E, n) of one recursion without drift."""
     before = jnp.concatenate([jnp.zeros_like(states[:1]), states[:-1]])
@@ -109,6 +112,7 @@ def noises_of(part: Recursion, levels: jax.Array, states: jax.Array) -> jax.Arra
     return jnp.einsum("eij,ej->ei", inverse_factors(part, levels), left)
 
 
+@partial(jax.jit, inline=True)
 def driven_states(part: Recursion, levels: jax.Array, noises: jax.Array) -> jax.Array:
     """States (E, n) of one recursion that whitened noises (E, n) drive at log levels (H,)."""
     path = rec.trajectory(part.F, factors(part, levels), part.drift[:, :, None], noises[:, :, None])

@@ -159,6 +159,7 @@ def respond(gain: Gains, states: jax.Array, b: jax.Array) -> jax.Array:
     return states @ earlier + back @ _next(recur(back, own, reverse=True))
 
 
+@partial(jax.jit, inline=True)
 def trajectory(F: jax.Array, L: jax.Array, c: jax.Array, noises: jax.Array) -> jax.Array:
     """States (E, n, m) of whitened noises (E, n, m) and drifts (E, n, m) (or (E, n, 1))."""
     return recur(F, L @ noises + c)

@@ -109,6 +109,7 @@ class Tilt(NamedTuple):
             return self.curvature @ columns
         return self.curvature.reshape(-1, *(1,) * (columns.ndim - 1)) * columns
 
+    @partial(jax.jit, inline=True)
     def between(self, first: Any, second: Any) -> Any:
         """Its entries at pairs of biases, two arrays of numbers."""
         if self.curvature.ndim == 2:

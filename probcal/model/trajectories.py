@@ -8,6 +8,7 @@ applied to each.
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from itertools import starmap
 from typing import Any, NamedTuple
 
@@ -65,4 +66,9 @@ class Loops:
 
     def by_target(self, values: Iterable[jax.Array]) -> tuple[jax.Array, ...]:
         """Sums (T, ...) of values (E, ...) over the epochs of each target, one per state layout."""
-        return self.each(lambda part, own, T: jax.ops.segment_sum(own, part.target, T), values, self.targets)
+        return self.each(lambda part, own, T: _sums(own, part.target, T), values, self.targets)
+
+
+@partial(jax.jit, static_argnums=2, inline=True)
+def _sums(values: jax.Array, group: jax.Array, groups: int) -> jax.Array:
+    return jax.ops.segment_sum(values, group, groups)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -141,6 +142,7 @@ def differing(model: Model, along: Sequence[np.ndarray]) -> Model:
     return replace(model.with_rows(stepped, along), blocks=blocks, biases=(1 + q) * M, tilt=None)
 
 
+@partial(jax.jit, inline=True)
 def placed(model: Model, mine: Sequence[jax.Array], place: jax.Array) -> Model:
     """The first node of the rows `mine` (N,) of each block moved to a place (d,)."""
 
