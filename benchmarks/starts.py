@@ -171,6 +171,7 @@ def swaps(args):
 
     import probcal
     from probcal import EA
+    from probcal.results.modes import rivals
 
     sound = Path(args.data) / SHIPPED["sflab"]
     flight = Path(args.data) / SHIPPED["tdoa_flight"]
@@ -184,7 +185,7 @@ def swaps(args):
         axes = "xyz"[: problem.network.dimension]
         labels = [[f"{prefix}{n}.position_{a}" for a in axes] for n in range(first, 8 + first)]
         error = [np.linalg.norm([mean[name] - truth.biases[name] for name in node]) for node in labels]
-        others = len(tree["mirror"].to_dataset()["mirror"]) if "mirror" in tree.children else 0
+        others = rivals(tree).sizes["mode"]
         of_the_two = max(error[n - first] for n in pair)
         print(f"{model.__name__} {pair}: {tree.attrs['status']}, largest error {max(error):.2f} m")
         seconds = time.perf_counter() - begun

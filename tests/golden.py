@@ -42,6 +42,7 @@ from terminal import call
 
 import probcal as pc
 from probcal.geometry import bearing, norm
+from probcal.results.modes import rivals
 
 DATA = Path(__file__).parent / "data"
 TABLE = DATA / "golden.json"
@@ -624,8 +625,7 @@ def read(found):
         add_tracks(row, found)
     if "level" in found.children:
         row.setdefault("values", {}).update(column(found["level"].to_dataset()["std"].to_series()))
-    if "mirror" in found.children:
-        gain = found["mirror"].to_dataset()["gain"].values
+    if len(gain := rivals(found)["gain"].values):
         row["evidence"] = {f"other answer {k}": float(v) for k, v in enumerate(np.sort(gain)[::-1])}
     for name in ("objects", "rounds"):
         if name in found.attrs:

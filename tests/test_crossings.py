@@ -18,6 +18,7 @@ from probcal.modes.reflections import Plane, across
 from probcal.plots.interactive import interactive_map, layers
 from probcal.plots.map import plot_map
 from probcal.plots.scene import scene
+from probcal.results.modes import rivals
 from probcal.sensors import ranger, tdoa
 
 PLACES = [(0, 10), (40, -14), (80, 12), (120, -9), (60, 40), (20, -40), (100, -38)]
@@ -145,7 +146,7 @@ def test_where_nothing_tells_the_sides_apart_both_are_told():
     assert "Another answer fits as well" in tree.attrs["message"]
     assert "on which side of the path such a node stands" in tree.attrs["message"]
     assert "Survey a position off" not in tree.attrs["message"]
-    group = tree["mirror"].to_dataset()
+    group = rivals(tree)
     assert group["kind"].values.tolist() == ["node"]
     there, here = float(group["bias"].sel(bias_label="b0.position_y")[0]), bias(tree, "b0.position_y")[0]
     assert here + there == pytest.approx(-20.0, abs=2.0)
@@ -168,7 +169,7 @@ def test_where_nothing_tells_the_sides_apart_both_are_told():
 def test_chains_cross_with_a_node_alone(seed, method):
     """Shares of the draws on each side are those of the evidences, within 0.06."""
     problem = beside(seed, 0.3, scale=20.0)
-    gain = probcal.fit(problem, MAP(trajectory="joint"))["mirror"]["gain"].item()
+    gain = rivals(probcal.fit(problem, MAP(trajectory="joint")))["gain"].item()
     tree = probcal.fit(problem, method, prior=Gaussian())
     sampled = tree["sample_stats"].to_dataset()
     assert sampled["crossed"].mean() > 0.2

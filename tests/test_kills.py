@@ -48,7 +48,7 @@ KINDS = {  # command, its results, its parts while it runs, and groups that must
     "collapsed": (("fit", "--method", "collapsed", "--chains", "2", "--draws"), "fit.nc", "draws/chunk-*.npz",
                   ("posterior", "sample_stats", "calibration")),
     "ea-maximised": (("fit", "--method", "ea-maximised", "--starts"), "fit.nc", "draws/loop-*.npz",
-                     ("posterior", "optimum", "optimisation")),
+                     ("posterior", "mode", "optimisation")),
     "nuts": (("fit", "--method", "nuts", "--chains", "2", "--warmup", "100", "--draws"), "fit.nc", "draws/chunk-*.npz",
              ("posterior", "sample_stats", "calibration")),
     "sbc": (("sbc", "--method", "map", "--posterior", "--runs"), "sbc.nc", "runs/runs-*.npz",

@@ -27,6 +27,7 @@ from probcal.inference.sampler import Sampler
 from probcal.model.model import At
 from probcal.noise import AdditiveNoise, Normal
 from probcal.priors import PRIORS, Precision, Prior
+from probcal.results.modes import started
 from probcal.results.schema import TYPE_II
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks" / "papers"))
@@ -281,14 +282,15 @@ def test_paper_b_marginalises_each_epoch_alone():
 
 def test_every_optimum_is_reported_the_best_first():
     tree = solve(EA(precisions="maximised"), starts=3, key=1)[2]
-    optima = tree["optimum"].to_dataset()
-    assert optima["bias"].dims == ("optimum", "bias_label")
-    assert optima.sizes["optimum"] == 3
-    assert optima[TYPE_II].values.argmax() == 0
-    assert tree.attrs[TYPE_II] == optima[TYPE_II].values[0]
+    optima = started(tree)
+    assert optima["bias"].dims == ("mode", "bias_label")
+    assert sorted(optima["start"].values) == [0, 1, 2]
+    assert optima["objective"].values.argmax() == 0
+    assert optima.attrs["objective"] == TYPE_II
+    assert tree.attrs[TYPE_II] == optima["objective"].values[0]
     np.testing.assert_array_equal(optima["bias"].values[0], tree["calibration"]["mean"].values)
     again = solve(EA(precisions="maximised"), starts=3, key=1)[2]
-    np.testing.assert_array_equal(again["optimum"]["bias"].values, optima["bias"].values)
+    np.testing.assert_array_equal(again["mode"]["bias"].values, tree["mode"]["bias"].values)
 
 
 @dataclass(frozen=True)

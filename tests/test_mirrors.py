@@ -24,6 +24,7 @@ from probcal.modes.mirrors import Mirrored, Sides, other_sides
 from probcal.modes.reflections import planes, reflect, reflect_nodes
 from probcal.plots.map import plot_map
 from probcal.results.answer import Answer
+from probcal.results.modes import rivals
 from probcal.sensors import radar, ranger
 from probcal.status import Status
 
@@ -87,7 +88,7 @@ def test_a_limit_ends_the_search_for_mirror_images():
         found[slow], _ = calibrate(problem, probcal.MAP(), monitor=monitor)
     said = "Ended by the limit of 300 s before mirror images were looked at"
     assert [said in tree.attrs["message"] for tree in found.values()] == [True, False]
-    assert ["mirror" in tree.children for tree in found.values()] == [False, True]
+    assert [rivals(tree).sizes["mode"] for tree in found.values()] == [0, 1]
     assert all(tree.attrs["status"] == "converged" for tree in found.values())
     assert list(phases) == ["start", "climb", "mirror images", "mirror image 1 of 1"]
 
@@ -102,17 +103,17 @@ def test_a_mirror_is_reported_with_its_biases_and_they_are_weak(name, form):
     tree = probcal.fit(problem, **given)
     assert "Another answer fits as well" in tree.attrs["message"]
     assert "Survey a position off that" in tree.attrs["message"]
-    group, axis = tree["mirror"].to_dataset(), {"line": "y", "ceiling": "z"}[name]
+    group, axis = rivals(tree), {"line": "y", "ceiling": "z"}[name]
     assert abs(group["gain"].values[0]) < 0.1  # the first is the best
     across = [label for label in problem.labels if label.endswith(f"position_{axis}")]
     own = tree["calibration"]["mean"].sel(bias_label=across).values
     sd = tree["calibration"]["sd"].sel(bias_label=across).values
-    there = group["bias"].isel(mirror=0).sel(bias_label=across).values
+    there = group["bias"].isel(mode=0).sel(bias_label=across).values
     np.testing.assert_allclose(there, -own, atol=1.5 * sd.max())
     level = {"line": 0.0, "ceiling": 3.0}[name]
     track = only(tree)["mean"].values[:, problem.network.dimension - 1]
     other = tree["mirror/track/target"]["position"]
-    np.testing.assert_allclose(other.isel(mirror=0).sel(axis=axis) - level, level - track, atol=1.0)
+    np.testing.assert_allclose(other.isel(mode=0).sel(axis=axis) - level, level - track, atol=1.0)
     legend = [text.get_text() for text in plot_map(tree).get_legend().get_texts()]
     assert "fits as well" in legend
     verdicts = probcal.assess(problem, tree)["verdict"].to_dataset()
@@ -205,14 +206,14 @@ def test_a_mirror_is_reported_in_sparse_form(method, prior):
     problem, _ = networks.setting(0, "line", share=1.0)
     tree = probcal.fit(problem, method, prior=prior)
     assert "Another answer fits as well" in tree.attrs["message"]
-    group = tree["mirror"].to_dataset()
+    group = rivals(tree)
     across = [label for label in problem.labels if label.endswith("position_y")]
     own = tree["calibration"].to_dataset().sel(bias_label=across)
     assert abs(group["gain"].values[0]) < 1e-3
-    there = group["bias"].isel(mirror=0).sel(bias_label=across).values
+    there = group["bias"].isel(mode=0).sel(bias_label=across).values
     np.testing.assert_allclose(there, -own["mean"].values, atol=2 * own["sd"].values.max())
     found = probcal.assess(problem, tree)
-    away = group["apart"].isel(mirror=0).values > 2
+    away = group["apart"].isel(mode=0).values > 2
     assert away.any()
     judged = found["verdict"].to_dataset()
     assert set(judged["verdict"].values[away].tolist()) <= {"weak", "prior only"}
@@ -231,14 +232,14 @@ def test_an_answer_outlives_the_memory_that_its_other_side_takes():
         tree = probcal.fit(problem, probcal.MAP(engine="cholmod"), prior=probcal.Gaussian())
     assert tree.attrs["status"] == "converged"
     assert "Memory did not hold" in tree.attrs["message"]
-    assert "mirror" not in tree.children
+    assert not rivals(tree).sizes["mode"]
 
 
 @pytest.mark.slow
 def test_nodes_that_span_the_plane_have_no_mirror_in_sparse_form():
     problem, _ = networks.setting(1, "beacons")
     tree = probcal.fit(problem, probcal.MAP(engine="cholmod"), prior=probcal.Gaussian())
-    assert "mirror" not in tree.children
+    assert not rivals(tree).sizes["mode"]
     assert "nother answer" not in tree.attrs["message"]
 
 
@@ -252,7 +253,7 @@ def test_pieces_of_sixty_pairs_of_tracks_are_turned():
         for name, path in paths.items():
             track = tree[f"track/{name}"].to_dataset()
             there = off(track["mean"].values, path[np.round(track["time"].values * 2).astype(int)])
-            if there > 6 and "mirror" not in tree.children:
+            if there > 6 and not rivals(tree).sizes["mode"]:
                 lost.append((seed, name, there))
     assert not lost
 
@@ -268,7 +269,7 @@ def test_pieces_of_fifty_tracks_are_turned():
         problem, path = beside(seed)
         tree = probcal.fit(problem, start=on_the_wrong_side(problem, seed), key=seed)
         there = off(only(tree)["mean"].values, path)
-        if there > 6 and "mirror" not in tree.children:
+        if there > 6 and not rivals(tree).sizes["mode"]:
             lost.append((seed, there))
     assert not lost
 
@@ -339,7 +340,7 @@ def test_chains_visit_both_sides_by_their_weights(method):
     biases = {"b1.position_y": 4.0, "b2.position_y": -3.0}
     drawn = simulate(network, ConstantVelocity(0.5), time, key=0, biases=biases, tracks={"target": path})
     problem = Problem(network, target, drawn.table, fix=networks.FIXED["line"])
-    gain = probcal.fit(problem, probcal.MAP(trajectory="joint"))["mirror"]["gain"].item()
+    gain = rivals(probcal.fit(problem, probcal.MAP(trajectory="joint")))["gain"].item()
     assert -2.5 < gain < -0.4
     tree = probcal.fit(problem, method, prior=probcal.Gaussian())
     stats = tree["sample_stats"].to_dataset()

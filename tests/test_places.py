@@ -13,6 +13,7 @@ from probcal.gaussian.places import places_of, tilt_of
 from probcal.inference.fit import calibrate
 from probcal.modes import automatic_start
 from probcal.priors import Precision
+from probcal.results.modes import rivals
 
 ANCHORS = np.array([(0.0, 0.0), (40.0, 0.0), (0.0, 40.0)])
 STD, OFFSET, CENTRE, SPREAD = 1.0, 6.0, np.array([15.0, 12.0]), 10.0
@@ -183,7 +184,7 @@ def test_the_other_side_is_seen_where_places_are_integrated():
     problem = line_of_anchors()
     tree = pc.assess(problem, pc.fit(problem, pc.MAP()))
     assert tree.attrs["places"] == "integrated"
-    gain = tree["mirror"]["gain"].values
+    gain = rivals(tree)["gain"].values
     assert np.abs(gain).max() < 0.01
     assert tree["verdict"]["verdict"].sel(bias_label="a2.position_y") == "weak"
 

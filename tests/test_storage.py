@@ -41,6 +41,7 @@ from probcal.inference import identity
 from probcal.inference.manifest import MANIFEST, remove_run, stored_run, write_manifest
 from probcal.inference.storage import Chunks, Records, Storage
 from probcal.results.io import SEAL, SMALL, _semi_definite, check_content
+from probcal.results.modes import alike
 
 RUN = {"method": "NUTS()", "seed": "1", "model": "abc"}
 
@@ -563,6 +564,39 @@ def sparse(place, covariance=1.0):
         tree["calibration"] = xr.DataTree(one)
 
     return change
+
+
+def test_a_file_of_version_3_has_its_other_answers_in_one_group(tmp_path):
+    """A mirror, found again from start 1; start 0 is the answer reported; start 2 came back, 3 ended far below."""
+    tree = committed.tree("map")
+    group = tree["calibration"].to_dataset()
+    mean, sd, labels = group["mean"].values, group["sd"].values, {"bias_label": group["bias_label"].values}
+    there = mean + 5 * sd
+    del tree["mode"]
+    biases, dims = np.stack([mean, there, mean + 0.1 * sd, mean - 9 * sd]), ("optimum", "bias_label")
+    scores = {"objective": ("optimum", [-1.0, -2.0, -1.0, -50.0]), "start": ("optimum", range(4))}
+    tree["optimum"] = xr.DataTree(
+        xr.Dataset({"bias": (dims, biases), "status": ("optimum", ["converged"] * 4), **scores}, labels)
+    )
+    apart = ("mirror", "bias_label")
+    mirror = {"gain": ("mirror", [-1.0]), "kind": ("mirror", ["scene"]), "bias": (apart, there[None])}
+    tree["mirror"] = xr.DataTree(xr.Dataset(mirror, {"mirror": ["turned"], **labels}, {"same": 3.0}))
+    car = tree["track/car"].to_dataset()
+    places = car["mean"].sel(component=["position_x", "position_y"]).values[None]
+    position = {"position": (("mirror", "time", "axis"), 1.0 + places)}
+    tree["mirror/track/car"] = xr.DataTree(xr.Dataset(position, {"time": car["time"]}, {"target": "car"}))
+    tree.attrs["results_version"] = 3
+    probcal.save(tree, tmp_path / "fit.nc")
+    tree = probcal.load(tmp_path)
+    found = tree["mode"].to_dataset()
+    assert found["kind"].values.tolist() == ["reported", "scene", "again", "rejected"]
+    assert found["start"].values.tolist() == [0, 1, 2, 3]
+    assert found["gain"].values.tolist() == [0.0, -1.0, 0.0, -49.0]
+    assert alike(tree)["mode"].values.tolist() == ["turned"]
+    np.testing.assert_allclose(found["apart"].max("bias_label"), [0.0, 5.0, 0.1, 9.0])
+    shown = tree["mode/track/car"]["position"].values
+    np.testing.assert_allclose(shown[1] - shown[0], 1.0)
+    assert {"mirror", "optimum"}.isdisjoint(tree.children)
 
 
 LACKS = [

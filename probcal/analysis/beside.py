@@ -11,17 +11,15 @@ from probcal.inference.fitted import Judged
 from probcal.labels import PIECE, SCENE
 from probcal.modes.clocks import EXPLAINED, turning_time
 from probcal.modes.reflections import touched
+from probcal.results.modes import alike, rivals
 from probcal.results.read import each_track, saved_by_epoch
-
-BEYOND = 2.0  # sd that an answer as good may be away
+from probcal.results.schema import DIFFERENT
 
 
 def mirror_findings(tree: xr.DataTree) -> list[Finding]:
     """One for each answer that fits about as well."""
-    if "mirror" not in tree.children:
-        return []
-    group = tree["mirror"].to_dataset()
-    pairs = zip(group["mirror"].values, group["gain"].values, strict=True)
+    group = rivals(tree)
+    pairs = zip(group["mode"].values, group["gain"].values, strict=True)
     return [Finding("mirror", "fit", f"{name}: an answer {abs(gain):.1f} nats apart") for name, gain in pairs]
 
 
@@ -34,21 +32,13 @@ def mirror_doubts(
     `variances` are those (E, n) of the states of each recursion on this side of it, by default those of the saved
     tracks.
     """
-    found = dict[int, str]()
-    if "mirror" not in tree.children:
-        return found
-    group = tree["mirror"].to_dataset()
-    alike = np.flatnonzero(group["gain"].values > -group.attrs["same"])
-    for k in alike:
-        away = group["apart"].values[k]
-        for m in np.flatnonzero(away > BEYOND):
-            found.setdefault(
-                int(m), f"it is {away[m]:.1f} sd away in an answer that fits as well: {group['mirror'].values[k]}"
-            )
-    kinds = group["kind"].values if "kind" in group else np.full(len(group["gain"]), SCENE)  # those of older files
-    if {SCENE, PIECE} & set(kinds[alike].tolist()):
+    found, group = dict[int, str](), alike(tree)
+    for name, away in zip(group["mode"].values, group["apart"].values, strict=True):
+        for m in np.flatnonzero(away > DIFFERENT):
+            found.setdefault(int(m), f"it is {away[m]:.1f} sd away in an answer that fits as well: {name}")
+    if {SCENE, PIECE} & set(group["kind"].values.tolist()):
         near, where = touched(fit.problem, fit.point, variances() if variances else _saved(fit, tree))
-        if near < BEYOND:
+        if near < DIFFERENT:
             every = dict.fromkeys(range(fit.problem.model.biases), f"{where}, which hides on which side it goes on")
             return every | found
     return found

@@ -20,6 +20,7 @@ from probcal.errors import InputError, checked
 from probcal.labels import check_name, label_parts, listed, step_of
 from probcal.linalg import marginalise
 from probcal.results.answer import HALF
+from probcal.results.modes import rivals
 from probcal.results.read import stated_values
 from probcal.results.schema import INTERVAL, held_biases, matrix_of
 from probcal.status import Status
@@ -243,7 +244,7 @@ def _findings(found: xr.Dataset, pair: dict[str, xr.DataTree]) -> list[Finding]:
     for name, tree in pair.items():
         if "verdict" not in tree.children:
             said.append(Finding("assess", name, f'"{name}" was not assessed: the declared noise is taken as right'))
-        if "mirror" in tree.children:
+        if rivals(tree).sizes["mode"]:
             said.append(Finding("mirror", name, f'"{name}" has another answer on the other side of a mirror'))
     return said
 

@@ -29,8 +29,8 @@ from probcal.network import Network
 from probcal.nodes import write_network
 from probcal.results.alignment import KINDS
 from probcal.results.io import save
+from probcal.results.modes import started
 from probcal.results.read import outliers, summary, with_calibration
-from probcal.results.schema import evidence_in
 from probcal.status import INVALID, Status
 
 FINDINGS = 8  # sentences of an assessment that are printed
@@ -192,11 +192,10 @@ def _print_verdict(tree: xr.DataTree, seconds: float) -> None:
         total = tree["residual"].sizes["datum"]
         first = listed.iloc[0]
         print(f"{len(listed)} of {total} data count less than half; the least: row {first['row']}, {first['sensor']}")
-    if "optimum" in tree.children:
-        optima = tree["optimum"].to_dataset()
-        score = optima[evidence_in(optima) or "objective"]
-        pairs = zip(optima["start"].values, optima["status"].values, score.values, strict=True)
-        print(f"{score.name} by start: " + ", ".join(f"{k}: {value:.2f} ({status})" for k, status, value in pairs))
+    if (optima := started(tree)) is not None:
+        pairs = zip(*(optima[name].values for name in ("start", "status", "objective")), strict=True)
+        listed_ = ", ".join(f"{k}: {value:.2f} ({status})" for k, status, value in pairs)
+        print(f"{optima.attrs['objective']} by start: {listed_}")
     for suffix, how in (("", ""), *((f"_{kind}", f", {kind} alignment") for kind in KINDS)):
         if f"position_rmse_after{suffix}" in attrs:
             before, after = (attrs[f"position_rmse_{when}{suffix}"] for when in ("before", "after"))

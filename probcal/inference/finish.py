@@ -19,7 +19,8 @@ from probcal.labels import NODE, START, listed
 from probcal.modes.mirrors import SAME, Mirrored
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.results.build import add_mirrors, add_optima, build
+from probcal.results.build import build
+from probcal.results.schema import DIFFERENT
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 SAVE = ("states", "predictive")
 NAMED = 4  # directions, or biases, that a message names
 ALONE = 20  # combinations of the biases of single sensors that a large fit names
-DIFFERENT = 2.0  # sd from which a bias is another one in another answer
 
 
 def finished(answer: Answer, key: jax.Array, keep: tuple[str, ...], monitor: Monitor) -> tuple[xr.DataTree, Answer]:
@@ -41,10 +41,6 @@ def finished(answer: Answer, key: jax.Array, keep: tuple[str, ...], monitor: Mon
     if not answer.posterior.sound:
         raise FitError(answer.message)
     found = build(answer, directions, key, keep)
-    if answer.optima:
-        found = add_optima(found, answer.optima, answer.best)
-    if answer.mirrors:
-        found = add_mirrors(found, answer)
     found.attrs["weak"] = count
     if monitor.signal:
         found.attrs["interrupted"] = 1

@@ -51,7 +51,7 @@ def fit(
     each kind has hyper-parameters of its own. `key` is a seed or jax key of the draws and of
     further starts; `start` replaces the automatic start. `starts` runs the method from so many
     starts, the further ones with two nodes swapped or a share of the biases drawn: the best optimum
-    is reported, all of them with their evidence in the group `optimum`. `save` names draws that the
+    is reported, all of them with their evidence in the group `mode`. `save` names draws that the
     tree keeps beside those of the biases and of the log-likelihood: "states" of every epoch
     (large), "predictive" replicas of the data. A method
     writes its draws, or the states of its climbs, to the folder `store` while it runs; `resume`

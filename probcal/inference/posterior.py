@@ -104,7 +104,7 @@ def conclude_draws(
     ended = bias_status(problem, {"not mixed": mixed["r_hat"][: run.form.biases] > 1.05} if "r_hat" in mixed else {})
     return Answer(
         problem, run.method, run.asked, prior, posterior, status, message, ended, run.z.shape[1],
-        interrupted=bool(run.stopped), mirrors=_mirrors(run),
+        interrupted=bool(run.stopped), mirrors=_mirrors(run, str(status)),
     )  # fmt: skip
 
 
@@ -117,7 +117,7 @@ def heaviest(run: SamplerRun) -> int:
     return int(np.bincount(run.side.ravel()).argmax())
 
 
-def _mirrors(run: SamplerRun) -> tuple[Mirrored, ...]:
+def _mirrors(run: SamplerRun, status: str) -> tuple[Mirrored, ...]:
     """The other sides that draws are on, seen from the heaviest: log ratio of weights, and shift of the means."""
     first, share = heaviest(run), np.bincount(run.side.ravel(), minlength=len(run.sides) + 1) / run.side.size
     middle = run.z[run.side == first].mean(0)
@@ -127,7 +127,8 @@ def _mirrors(run: SamplerRun) -> tuple[Mirrored, ...]:
             other = run.sides[int(k or first) - 1]  # of the first side, what was reflected to leave it
             shift = run.z[run.side == k].mean(0) - middle
             point = other.point if k else _framed(run)
-            found.append(Mirrored(other.name, float(np.log(share[k] / share[first])), point, shift))
+            gain = float(np.log(share[k] / share[first]))
+            found.append(Mirrored(other.name, gain, point, shift, status=status))
     return tuple(found)
 
 

@@ -26,13 +26,12 @@ from probcal.modes.reflections import new, reach
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
+from probcal.results.modes import ELSEWHERE, LEAST
+from probcal.results.schema import DIFFERENT
 
-ELSEWHERE = "found from another start"
 ROUNDS = 8  # answers in turn, each with the rows where the one before puts them
 STILL = 0.1  # sd by which no clock moves at the end of them
 TRIES = 3  # climbs by particles from one start
-DIFFERENT = 2.0  # sd by which an answer from another start must differ in some bias to be one of its own
-APART = 0.01  # scales that count as an sd where that is smaller
 
 
 def solve(
@@ -262,7 +261,8 @@ def _beside_mirrors(answer: Answer, method: Maximiser, context: Context) -> Answ
     for side, one in found:
         if one is not best:
             (name, kind), place = side if side[0] else way, one.posterior
-            mirrors.append(Mirrored(name, _weight(one) - first - gain, place.point, place.summary.mean - mean, kind))
+            shift, status = place.summary.mean - mean, str(one.status)
+            mirrors.append(Mirrored(name, _weight(one) - first - gain, place.point, shift, kind, status))
     mirrors += [o._replace(gain=o.gain - gain, shift=np.asarray(o.point.z) - mean) for o in unfitted]
     mirrors = sorted((other for other in mirrors if other.gain > -NEAR), key=lambda other: -other.gain)
     best = best.noted(unseen, motion=answer.motion, optima=answer.optima, best=answer.best, mirrors=tuple(mirrors))
@@ -318,7 +318,7 @@ def _beside_optima(answer: Answer, others: Sequence[Answer]) -> tuple[Mirrored, 
         if not (other.status.valid and other.posterior.sound and gain > -NEAR):
             continue
         there = other.posterior.here[0]
-        if all(np.max(np.abs(there - one) / np.maximum(sd, APART), initial=0.0) > DIFFERENT for one in known):
+        if all(np.max(np.abs(there - one) / np.maximum(sd, LEAST), initial=0.0) > DIFFERENT for one in known):
             found.append(Mirrored(ELSEWHERE, gain, other.posterior.point, there - mean, START))
             known.append(there)
     return tuple(found)

@@ -55,6 +55,7 @@ class Mirrored(NamedTuple):
     point: Point
     shift: np.ndarray  # (M,) its biases z less those of the answer
     kind: str = SCENE
+    status: str = ""  # of the fit from there; empty where it was found only
 
 
 class SideClimb(NamedTuple):

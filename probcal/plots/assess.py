@@ -37,7 +37,8 @@ def plot_shrinkage(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     columns = tree["calibration"].to_dataset()[["sd", "scale", "gamma"]].assign(tree["verdict"].to_dataset())
     frame: Any = columns.to_dataframe()
     frame["contraction"] = 1.0 - (frame["sd"] / frame["scale"]) ** 2
-    for word, (tint, mark) in VERDICTS.items():
+    others = dict.fromkeys(sorted(set(frame["verdict"]) - set(VERDICTS)), ("black", "P"))
+    for word, (tint, mark) in (VERDICTS | others).items():
         own = frame[frame["verdict"] == word]
         if len(own):
             ax.plot("contraction", "gamma", mark, data=own, color=tint, markersize=6, label=f"{word} ({len(own)})")

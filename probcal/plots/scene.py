@@ -13,12 +13,13 @@ import xarray as xr
 from probcal.errors import InputError
 from probcal.geodesy import GEODETIC, LocalFrame
 from probcal.labels import AXES, NODE, coordinates
+from probcal.results.modes import alike
 from probcal.results.read import bias_values, each_object, each_target
+from probcal.results.schema import DIFFERENT
 
 ARC = 48  # corners of a sector's arc
 SEEN = 0.5  # share of an object in view at which the outline of a view is drawn
 ASIDE = 0.25  # of the extent of nodes and tracks up to which views and faint objects widen the map
-BEYOND = 2.0  # sd from which a node stands elsewhere in an answer that fits as well
 SURE = 0.5  # existence from which an object widens it at all
 
 
@@ -105,9 +106,8 @@ def scene(tree: xr.DataTree) -> Scene:
     """Read the map of a fit; raises `InputError` for a tree that is none."""
     if not {"calibration", "constant_data"} <= set(tree.children):
         raise InputError("the map needs a result of fit(), with its groups calibration and constant_data")
-    nodes, tracks, alike = _places(tree), list(_tracks(tree)), _alike(tree)
-    mirrored = [] if alike is None else list(_mirrored(tree, alike))
-    elsewhere = np.empty((0, 2, nodes.stated.shape[1])) if alike is None else _elsewhere(alike, nodes)
+    nodes, tracks, others = _places(tree), list(_tracks(tree)), alike(tree)
+    mirrored, elsewhere = list(_mirrored(tree, others)), _elsewhere(others, nodes)
     attrs = tree["constant_data"].attrs
     frame = LocalFrame(*(float(attrs[name]) for name in GEODETIC)) if GEODETIC[0] in attrs else None
     objects = [Found(name, *rest) for name, *rest in each_object(tree, AXES[: nodes.stated.shape[1]])]
@@ -170,33 +170,24 @@ def _tracks(tree: xr.DataTree) -> Iterator[Track]:
             yield Track(target, group["time"].values, *(own.values for own in places))
 
 
-def _alike(tree: xr.DataTree) -> xr.Dataset | None:
-    """Answers that fit as well, without their tracks, with their numbers; None where there is none."""
-    if "mirror" not in tree.children:
-        return None
-    group = tree["mirror"].to_dataset()
-    group = group.assign(number=("mirror", np.arange(group.sizes["mirror"])))
-    return group.isel(mirror=group["gain"].values > -group.attrs["same"])
-
-
-def _mirrored(tree: xr.DataTree, alike: xr.Dataset) -> Iterator[Track]:
+def _mirrored(tree: xr.DataTree, others: xr.Dataset) -> Iterator[Track]:
     """Tracks of the best answer on the other side of a mirror, where one fits as well."""
-    others = alike.isel(mirror=alike["kind"].values != NODE)
-    if others.sizes["mirror"]:
+    others = others.isel(mode=others["kind"].values != NODE)
+    if others.sizes["mode"]:
         best = int(others["number"].values[others["gain"].values.argmax()])
-        for target, group in each_target(tree.children["mirror"]):
-            places = group["position"].isel(mirror=best).values
+        for target, group in each_target(tree.children["mode"]):
+            places = group["position"].isel(mode=best).values
             unknown = np.full(places.shape, np.nan)
             yield Track(target, group["time"].values, places, places, unknown, unknown)
 
 
-def _elsewhere(alike: xr.Dataset, nodes: Places) -> np.ndarray:
+def _elsewhere(others: xr.Dataset, nodes: Places) -> np.ndarray:
     """Where nodes were found and where they stand in answers that fit as well (K, 2, d), if that is another place."""
     d, found = nodes.stated.shape[1], list[np.ndarray]()
-    at = alike.get_index("bias_label").get_indexer(pd.Index(_coordinates(nodes.name, d))).reshape(-1, d)
-    for bias, apart in zip(alike["bias"].values, alike["apart"].values, strict=True):
+    at = others.get_index("bias_label").get_indexer(pd.Index(_coordinates(nodes.name, d))).reshape(-1, d)
+    for bias, apart in zip(others["bias"].values, others["apart"].values, strict=True):
         there = np.where(at >= 0, nodes.stated + bias[at], nodes.calibrated)
-        other = np.where(at >= 0, apart[at], 0.0).max(1) > BEYOND
+        other = np.where(at >= 0, apart[at], 0.0).max(1) > DIFFERENT
         found.append(np.stack([nodes.calibrated, there], 1)[other])
     return np.concatenate([np.empty((0, 2, d)), *found])
 

@@ -7,8 +7,9 @@ import numpy as np
 import xarray as xr
 
 from probcal.report.words import bias_frame, fixed, number, rounded, said_once
+from probcal.results.modes import started
 from probcal.results.read import frame_of, outliers
-from probcal.results.schema import EVIDENCES, evidence_in, held_biases
+from probcal.results.schema import EVIDENCES, held_biases
 from probcal.status import INVALID
 
 BIASES = 400  # of the table of all: the others are in summary.csv
@@ -149,18 +150,15 @@ def _of_scans(tree: xr.DataTree) -> Iterator[dict[str, Any]]:
 
 def _of_data(tree: xr.DataTree) -> Iterator[dict[str, Any]]:
     """Tables of the optima of several starts, of the data that count least, and of the checks of an assessment."""
-    if "optimum" in tree.children:
-        group = tree["optimum"].to_dataset()
-        scale = tree["calibration"].to_dataset()["scale"].values
-        apart = np.abs((group["bias"].values - group["bias"].values[0]) / scale).max(1)
-        score = evidence_in(group) or "objective"
+    if (optima := started(tree)) is not None:
+        score = optima.attrs["objective"]
         columns: dict[str, Any] = {
-            "start": group["start"].values.astype(str),
-            "status": group["status"].values,
-            EVIDENCES.get(score, score): [number(value, 7) for value in group[score].values],
-            "largest difference, in scales": [number(value) for value in apart],
+            "start": optima["start"].values.astype(str),
+            "status": optima["status"].values,
+            EVIDENCES.get(score, score): [number(value, 7) for value in optima["objective"].values],
+            "largest difference, in scales": [number(value) for value in optima["far"].values],
         }
-        yield _table("Optima of several starts", columns, most=len(apart))
+        yield _table("Optima of several starts", columns, most=optima.sizes["mode"])
     if weighted(tree) and len(listed := outliers(tree)):
         numbers = {name: [number(value, 6) for value in listed[name]] for name in ("time", "residual/std", "weight")}
         texts: dict[str, Any] = {name: listed[name].astype(str) for name in ("row", "sensor", "target", "channel")}

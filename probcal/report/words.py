@@ -89,7 +89,8 @@ def _verdicts(tree: xr.DataTree) -> list[str]:
 def _judged(tree: xr.DataTree) -> str:
     """How many biases have which verdict."""
     count = Counter(_verdicts(tree))
-    told = [f"{count[name]} {name}" for name in ("determined", *ASIDE, "weak", "prior only") if count[name]]
+    known = dict.fromkeys(("determined", *ASIDE, "weak", "prior only", *sorted(count)))
+    told = [f"{count[name]} {name}" for name in known if count[name]]
     return f"; {', '.join(told)}" if told else ""
 
 

@@ -28,6 +28,7 @@ from probcal.results.groups import (
     gather,
     track_groups,
 )
+from probcal.results.modes import ELSEWHERE, LEAST, REPORTED, Mode, mode_group, unlike
 from probcal.results.schema import BOUND, EVIDENCE, INTERVAL, RESULTS_VERSION
 from probcal.table import first_date
 
@@ -59,6 +60,7 @@ def build(answer: Answer, directions: Sequence[Any], key: jax.Array, keep: tuple
     groups = {
         "posterior": _posterior_group(answer, draws),
         "calibration": _calibration_group(answer),
+        **_mode_groups(answer),
         **track_groups(problem, tracks, draws.states, _sample(draws) if len(draws.states) else None),
         "constant_data": constant_group(problem, posterior.point),
         **_data_groups(answer, draws, before, large),
@@ -239,43 +241,49 @@ def _origin(problem: Problem) -> dict[str, str]:
     return {"time_origin": date} if date else {}
 
 
-def add_optima(tree: xr.DataTree, answers: Sequence[Answer], best: int) -> xr.DataTree:
-    """Add the optima found from several starts, the reported one first: biases, evidence, objective, status."""
-    order = [best, *(k for k in range(len(answers)) if k != best)]
-    chosen, problem = [answers[k] for k in order], answers[best].problem
-    summaries = [answer.posterior.summary for answer in chosen]
-    values: dict[str, Any] = {
-        "bias": (("optimum", "bias_label"), np.stack([own.mean * problem.scales for own in summaries])),
-        "objective": ("optimum", np.array([answer.objective for answer in chosen])),
-        "status": ("optimum", np.array([str(answer.status) for answer in chosen])),
-        "start": ("optimum", np.array(order)),
-    }
-    evidence = np.array([np.nan if own.evidence is None else own.evidence for own in summaries])
-    name = BOUND if answers[0].problem.model.tailed else EVIDENCE[summaries[0].precisions]
-    if name in tree.attrs and np.isfinite(evidence).all() and summaries[0].precisions != "integrated":
-        values[name] = ("optimum", evidence)
-    tree["optimum"] = xr.DataTree(xr.Dataset(values, coords={"bias_label": list(problem.labels)}))
-    return tree
+def modes_of(answer: Answer) -> tuple[list[Mode], list[Sequence[Any]]]:
+    """All answers of a fit and the states (E, n) of each, the reported one first, then others by gain.
 
-
-def add_mirrors(tree: xr.DataTree, answer: Answer) -> xr.DataTree:
-    """Add the answers on other sides of a mirror: names, biases, places, and evidence less that of the answer.
-
-    `apart` says by how many sd each bias is another one there; within `same` nats an answer is as good. `kind` is what
-    stands on its other side: the scene, a piece of a track, a node alone; "start" where another start led there.
+    No other function reads what an `Answer` carries beside its own posterior.
     """
-    problem, others = answer.problem, answer.mirrors
-    shifts, (mean, sd) = np.stack([other.shift for other in others]), answer.posterior.here
-    values: dict[str, Any] = {
-        "gain": ("mirror", np.array([other.gain for other in others])),
-        "kind": ("mirror", np.array([other.kind for other in others], str)),
-        "bias": (("mirror", "bias_label"), (mean + shifts) * problem.scales),
-        "apart": (("mirror", "bias_label"), np.abs(shifts) / np.maximum(sd, 1e-12)),
-    }
-    names = [other.name for other in others]
-    group = xr.Dataset(values, coords={"mirror": names, **bias_coords(problem)}, attrs={"same": SAME})
-    places = [np.stack(own) for own in zip(*(problem.positions(other.point.states) for other in others), strict=True)]
-    axes = {"axis": list(AXES[: problem.network.dimension])}
-    tracks = by_target(problem, {"position": (("mirror", "time", "axis"), places)}, axes)
-    tree["mirror"] = xr.DataTree.from_dict({"/": group, **{f"track/{name}": own for name, own in tracks.items()}})
-    return tree
+    scales, posterior, optima = answer.problem.scales, answer.posterior, dict(enumerate(answer.optima))
+    mean, sd = (own * scales for own in posterior.here)
+    sd = np.maximum(sd, LEAST * scales)
+
+    def started(point: Point) -> dict[str, Any]:
+        """Start, status and objective of the answer of a start, each once; nothing of another answer."""
+        k = next((k for k, one in optima.items() if one.posterior.point is point), None)
+        return {} if k is None else _of_start(k, optima.pop(k))
+
+    known = {"status": str(answer.status)} | started(posterior.point)
+    modes, states = [Mode(REPORTED, REPORTED, mean, 0.0, **known)], [posterior.states]
+    for other in sorted(answer.mirrors, key=lambda other: -other.gain):
+        known = {"status": other.status} | started(other.point)
+        modes.append(Mode(other.name, other.kind, mean + other.shift * scales, other.gain, **known))
+        states.append(other.point.states)
+    for k, one in sorted(optima.items(), key=lambda item: -item[1].objective):
+        bias = one.posterior.here[0] * scales
+        gain = one.objective - answer.objective if one.method == answer.method else np.nan
+        modes.append(Mode(ELSEWHERE, unlike(bias, modes, sd), bias, gain, **_of_start(k, one)))
+        states.append(one.posterior.states)
+    return modes, states
+
+
+def _of_start(k: int, answer: Answer) -> dict[str, Any]:
+    return {"start": k, "status": str(answer.status), "objective": answer.objective}
+
+
+def _mode_groups(answer: Answer) -> dict[str, xr.Dataset]:
+    """The group `mode`, and the places of the tracks in each where there are several."""
+    problem, found = answer.problem, answer.posterior.summary
+    modes, states = modes_of(answer)
+    name = BOUND if problem.model.tailed else EVIDENCE.get(found.precisions, "")
+    known = found.evidence is not None and found.precisions != "integrated"
+    attrs = {"same": SAME, "objective": name if known and name else "objective"}
+    groups = {"mode": mode_group(modes, answer.posterior.here[1] * problem.scales, bias_coords(problem), attrs)}
+    if len(modes) > 1:
+        places = [np.stack(own) for own in zip(*map(problem.positions, states), strict=True)]
+        axes = {"axis": list(AXES[: problem.network.dimension])}
+        tracks = by_target(problem, {"position": (("mode", "time", "axis"), places)}, axes)
+        groups |= {f"mode/track/{name}": own for name, own in tracks.items()}
+    return groups

@@ -15,6 +15,7 @@ from probcal.files import write_whole
 from probcal.lazy import Later
 from probcal.results.accessor import register
 from probcal.results.blocks import SensorBlocks
+from probcal.results.modes import upgraded
 from probcal.results.schema import (
     ATTRIBUTES,
     BLOCKS,
@@ -94,7 +95,7 @@ def load(path: str | PathLike[str]) -> xr.DataTree:
         raise InputError(f"{path} is damaged: its checksum does not match its content; fit again")
     try:
         with xr.open_datatree(path, engine="h5netcdf") as tree:
-            tree = tree.load()
+            tree = upgraded(tree.load())
     except Exception as error:  # whatever the netCDF and HDF5 libraries say of foreign bytes
         raise InputError(f"{path} is not a fit written by probcal ({type(error).__name__}: {error})") from None
     check_content(tree, path)

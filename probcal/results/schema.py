@@ -1,4 +1,15 @@
-"""What a tree of results holds: version, columns, and what readers of a file take for granted."""
+"""The form of a tree of results: version, columns, and what readers of a file take for granted.
+
+Group `mode` (dimension `mode`) has all answers of a fit, the reported one first: its name, `kind` ("reported"; "scene",
+"piece", "node" or "start" of another answer, by what it differs; "again" of a further start that came back to one of
+them; "rejected" of one that ended far below or invalid), `gain` (evidence or log density less that of the reported
+answer, nats), `bias` and `apart` (its distance in sd) by bias, `status` of the fit from there (empty where the answer
+was found and not fitted), `start` (the number of the start that led to it, -1 of none) and its `objective`. An answer
+whose gain is above minus the attribute `same` fits as well. Of several answers `mode/track/<target>` has the places. A
+reader takes words that it does not know, as of a verdict or a kind, for what they are: texts.
+
+A file of version 3 has groups `mirror` and `optimum` for this one; `load` turns them into it (`results.modes`).
+"""
 
 from collections.abc import Container, Hashable
 from typing import Any, NamedTuple
@@ -8,7 +19,8 @@ import numpy as np
 from probcal.errors import InputError
 
 INTERVAL = 0.89  # probability of lower to upper
-RESULTS_VERSION = 3  # of the groups and variables that a fit writes; a reader refuses any other
+# of the groups and variables that a fit writes; a reader takes files of version 3 too and refuses any other
+RESULTS_VERSION = 4
 MORE = ("r_hat", "ess", "ess_tail", "inclusion", "included", "contraction")  # columns of samplers
 SUMMARY = ("bias", "unit", "scale", "mean", "sd", "lower", "upper", "gamma")
 
@@ -29,6 +41,7 @@ _BIAS_TEXT, _DATUM_TEXT = Member(_BIAS, "texts"), Member(_DATUM, "texts")
 _PAIR = ("bias_label", "bias_label_other")
 _POSITIVE = Member(_BIAS, least=0.0, finite=True)
 _DATUM_SIZE = Member(_DATUM, least=0.0)
+_MODE, _BY_MODE = ("mode",), ("mode", "bias_label")
 NEEDED = {  # what readers of a fit take for granted, by group
     "posterior": {"bias": Member(("chain", "draw", "bias_label"), finite=True)},
     "calibration": {
@@ -48,6 +61,11 @@ NEEDED = {  # what readers of a fit take for granted, by group
         "node_position": Member(("node", "axis"), finite=True), "node_heading": Member(("node",), finite=True),
         "moving": Member(("node",), "flags"), "stated": Member(("value",), finite=True),
         "stated_node": Member(("value",), "texts"), "stated_component": Member(("value",), "texts"),
+    },
+    "mode": {
+        "mode": Member(_MODE, "texts"), "kind": Member(_MODE, "texts"), "status": Member(_MODE, "texts"),
+        "gain": Member(_MODE), "start": Member(_MODE), "objective": Member(_MODE), "bias": Member(_BY_MODE),
+        "apart": Member(_BY_MODE, least=0.0),
     },
 }  # fmt: skip
 # unless in sparse form
@@ -73,6 +91,7 @@ JUDGED = {  # where they are
     },
 }
 ATTRIBUTES = ("method", "prior", "seed", "status", "message", "intervals", "settings", "interval_probability", "data")
+DIFFERENT = 2.0  # sd from which a bias is another one in another answer
 ROPE = 0.1  # scales within which a bias is practically zero
 TYPE_II = "log_evidence_type_ii"  # the largest over the precisions, which are then taken as known
 DECLARED = "log_evidence_declared"  # with every bias Gaussian of its declared scale, whatever the prior of the fit
