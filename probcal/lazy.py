@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from importlib import import_module
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from probcal.wings import installed, loaded
 
@@ -70,3 +70,10 @@ class Later:
         for part in parts:
             found = getattr(found, part)
         return getattr(found, name)
+
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+else:
+    pd, xr = Later("pandas"), Later("xarray")  # slow to load, and options are checked and help is printed without

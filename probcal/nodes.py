@@ -9,7 +9,7 @@ from dataclasses import replace
 from difflib import get_close_matches
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,17 +17,10 @@ from probcal.errors import InputError, nearest
 from probcal.files import parsed_json, write_whole
 from probcal.geodesy import GEODETIC, LocalFrame, check_place, earth_axes
 from probcal.labels import coordinates, step_of, unescaped
-from probcal.lazy import Later
+from probcal.lazy import pd, xr
 from probcal.network import ANGLES, POSE_UNITS, Network, Node
 from probcal.sensor import Bias
 from probcal.table import Table, csv_text, header, name_as_text, numbers, read_table, unit_factor
-
-if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
-else:
-    pd = Later("pandas")
-    xr = Later("xarray")
 
 LOCAL = ("x", "y", "z")
 PLACE_UNITS = dict.fromkeys((*LOCAL, "height"), "m") | dict.fromkeys(GEODETIC[:2], "deg")

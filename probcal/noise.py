@@ -6,7 +6,7 @@ To add a family, write a frozen dataclass that inherits `AdditiveNoise` with its
 drive a motion too, write the methods of `ScaleMixture`: noise is then normal given a precision drawn at every epoch.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, ClassVar, Protocol, runtime_checkable
@@ -183,22 +183,65 @@ FARTHEST = 30.0  # asinh of the farthest point of a quadrature, in std
 HALF = 0.5  # reliance below which a datum counts as rejected
 
 
-class Family(Protocol):
-    """What a noise family answers; `y`, `predicted`, `std` are arrays of one shape, `period` a number or None."""
+class Family:
+    """What a noise family answers; `y`, `predicted`, `std` are arrays of one shape, `period` a number or None.
 
-    def innovation(self, y, predicted, period: float | None): ...
-    def log_likelihood(self, y, predicted, std, period: float | None): ...
-    def score(self, y, predicted, std, period: float | None): ...
-    def weight(self, y, predicted, std, period: float | None): ...
-    def information(self, predicted, std): ...
-    def level_score(self, y, predicted, std, period: float | None): ...
-    def reliance(self, y, predicted, std, period: float | None): ...
+    The derivatives are those of its log-likelihood. A family that says no more relies on every datum.
+    """
+
+    def innovation(self, y, predicted, period):
+        """Measured value minus the predicted one."""
+        return y - predicted
+
+    def log_likelihood(self, y, predicted, std, period):
+        """Log density of each datum."""
+        raise NotImplementedError
+
+    def score(self, y, predicted, std, period):
+        """Derivative of the log density by the predicted value."""
+        return _derivative(lambda at: self.log_likelihood(y, at, std, period), predicted)
+
+    def weight(self, y, predicted, std, period):
+        """Positive curvature used by a step: the expected information."""
+        return self.information(predicted, std)
+
+    def information(self, predicted, std):
+        """Expected information about the predicted value."""
+        raise NotImplementedError
+
+    def level_score(self, y, predicted, std, period):
+        """One plus the derivative of the log density by log std."""
+        return 1.0 + std * _derivative(lambda at: self.log_likelihood(y, predicted, at, period), std)
+
+    def reliance(self, y, predicted, std, period):
+        """One: every datum counts alike."""
+        return jnp.ones_like(predicted)
+
     @property
-    def rejects(self) -> float: ...
-    def sample(self, key, predicted, std): ...
-    def emit(self, key, predicted, std): ...
-    def reported(self, y): ...
-    def check(self, y: np.ndarray) -> np.ndarray: ...
+    def rejects(self) -> float:
+        """Zero: no datum is rejected."""
+        return 0.0
+
+    def sample(self, key, predicted, std):
+        """Draw measured values around the predicted ones."""
+        raise NotImplementedError
+
+    def emit(self, key, predicted, std):
+        """Draw what reaches the sensor, of which it says what is `reported`; a family that hears all: `sample`."""
+        return self.sample(key, predicted, std)
+
+    def reported(self, y):
+        """What a sensor writes of what reaches it, NaN where it writes nothing; all of it here."""
+        return y
+
+    def check(self, y):
+        """Which values are legal: all."""
+        return np.ones(y.shape, bool)
+
+
+def _derivative(function: Callable[[Any], Any], at: Any) -> Any:
+    """Derivative of a function of each entry by that entry."""
+    return jax.jvp(function, (at,), (jnp.ones_like(at),))[1]
 
 
 @runtime_checkable
@@ -224,7 +267,7 @@ class ScaleMixture(Protocol):
         """Draws of w, given u where its square is given."""
 
 
-class AdditiveNoise:
+class AdditiveNoise(Family):
     """Noise added to the predicted value, std times e; a wrapped channel compares angles around the circle.
 
     A family of your own is a frozen dataclass that inherits this with the density of e and how it is drawn; all the
@@ -294,29 +337,14 @@ class AdditiveNoise:
         """Draw measured values around the predicted ones."""
         return predicted + std * self.draw(key, predicted.shape)
 
-    def emit(self, key, predicted, std):
-        """Draw what reaches the sensor, of which it says what is `reported`; a family that hears all: `sample`."""
-        return self.sample(key, predicted, std)
-
-    def reported(self, y):
-        """What a sensor writes of what reaches it, NaN where it writes nothing; all of it here."""
-        return y
-
-    def check(self, y):
-        """Which values are legal: all."""
-        return np.ones(y.shape, bool)
-
     def unit_information(self) -> Any:
         """Expected information at std 1, by quadrature of the squared score; of parameters (S,) by each."""
         if _functions(*self.__dict__.values()) is np:
             return _information_of(self)
         # the same in fewer points, which are an axis more of parameters that are estimated, () or (S,)
-        values = {name: value for name, value in self.__dict__.items() if isinstance(value, jax.Array)}
-        own = with_values(self, {name: value.reshape(-1, 1) for name, value in values.items()})
+        own, shape = _upright(self)
         e = own._points(jnp.sinh(np.linspace(-np.arcsinh(FAR_OUT), np.arcsinh(FAR_OUT), POINTS))[None])
-        square = own._slope(e) ** 2 * jnp.exp(own.log_density(e))
-        found = jnp.sum(0.5 * (square[:, 1:] + square[:, :-1]) * jnp.diff(e), -1)
-        return found.reshape(jnp.broadcast_shapes(*(value.shape for value in values.values())))
+        return _trapezoid(own._slope(e) ** 2 * jnp.exp(own.log_density(e)), e).reshape(shape)
 
     def _points(self, e):
         """Residuals over the std (increasing) at which a quadrature looks, from those that suit a wide density."""
@@ -324,7 +352,19 @@ class AdditiveNoise:
 
     def _slope(self, e):
         """Derivative of the log density by e."""
-        return jax.jvp(self.log_density, (e,), (jnp.ones_like(e),))[1]
+        return _derivative(self.log_density, e)
+
+
+def _upright(family: Any) -> tuple[Any, tuple[int, ...]]:
+    """A family with its parameters that are estimated as columns, and their shape, () or (S,)."""
+    values = {name: value for name, value in family.__dict__.items() if isinstance(value, jax.Array)}
+    own = with_values(family, {name: value.reshape(-1, 1) for name, value in values.items()})
+    return own, jnp.broadcast_shapes(*(value.shape for value in values.values()))
+
+
+def _trapezoid(values: Any, e: Any) -> Any:
+    """Integral of values (..., P) at points (P,) or (..., P) by the trapezoidal rule."""
+    return jnp.sum(0.5 * (values[..., 1:] + values[..., :-1]) * jnp.diff(e), -1)
 
 
 @lru_cache
@@ -392,6 +432,8 @@ def gate_limits(family: Any, odds: float) -> tuple[float, float]:
 class Normal(AdditiveNoise):
     """Additive Gaussian noise of standard deviation `std`."""
 
+    reliance, rejects = Family.reliance, Family.rejects
+
     def log_likelihood(self, y, predicted, std, period):
         """Log density of each datum."""
         r = self.innovation(y, predicted, period) / std
@@ -413,15 +455,6 @@ class Normal(AdditiveNoise):
         """One plus the derivative of the log density by log std (the mean square of a whitened residual)."""
         return (self.innovation(y, predicted, period) / std) ** 2
 
-    def reliance(self, y, predicted, std, period):
-        """One: every datum counts alike."""
-        return jnp.ones_like(predicted)
-
-    @property
-    def rejects(self) -> float:
-        """Zero: no datum is rejected."""
-        return 0.0
-
     def sample(self, key, predicted, std):
         """Draw measured values around the predicted ones."""
         return predicted + std * jax.random.normal(key, predicted.shape, predicted.dtype)
@@ -441,13 +474,12 @@ def _moments(family: AdditiveNoise, e: Any) -> tuple[Any, Any]:
     p = jnp.exp(family.log_likelihood(e, none, one, None))
     score, level = family.score(e, none, one, None), family.level_score(e, none, one, None) - 1.0
     there = p > 0
-    parts = (jnp.where(there, p * level**2, 0.0), jnp.where(there, p * score * level, 0.0))
-    square, cross = (jnp.sum(0.5 * (x[..., 1:] + x[..., :-1]) * jnp.diff(e), -1) for x in parts)
-    return square, cross
+    square, cross = (jnp.where(there, part, 0.0) for part in (p * level**2, p * score * level))
+    return _trapezoid(square, e), _trapezoid(cross, e)
 
 
 @dataclass(frozen=True)
-class Growing:
+class Growing(Family):
     """Additive `noise` whose std grows with the predicted value p (see `Grows`): s^2 = std^2 + (slope p)^2.
 
     With g = d log s / d p = slope^2 p / s^2 the score is that of the noise at s plus l g, l the derivative of its log
@@ -478,12 +510,6 @@ class Growing:
         """Log density of each datum."""
         return self.noise.log_likelihood(y, predicted, self.spread(predicted, std), period)
 
-    def score(self, y, predicted, std, period):
-        """Derivative of the log density by the predicted value, which the std has too."""
-        s, g = self._steep(predicted, std)
-        level = self.noise.level_score(y, predicted, s, period) - 1.0
-        return self.noise.score(y, predicted, s, period) + level * g
-
     def weight(self, y, predicted, std, period):
         """Positive curvature used by a step."""
         s, g = self._steep(predicted, std)
@@ -513,8 +539,6 @@ class Growing:
         """Draw measured values around the predicted ones."""
         return self.noise.sample(key, predicted, self.spread(predicted, std))
 
-    emit = sample
-
     def reported(self, y):
         """All of it."""
         return self.noise.reported(y)
@@ -540,10 +564,6 @@ class GrowingWithMeasured(Growing):
         """Log density of each datum."""
         return self.noise.log_likelihood(y, predicted, self.spread(y, std), period)
 
-    def score(self, y, predicted, std, period):
-        """Derivative of the log density by the predicted value."""
-        return self.noise.score(y, predicted, self.spread(y, std), period)
-
     def weight(self, y, predicted, std, period):
         """Positive curvature used by a step."""
         return self.noise.weight(y, predicted, self.spread(y, std), period)
@@ -556,9 +576,7 @@ def _estimated(family: Any) -> bool:
 
 def _moments_estimated(family: Any) -> tuple[Any, Any]:
     """The moments of a family whose parameters are arrays () or (N,)."""
-    values = {name: value for name, value in family.__dict__.items() if isinstance(value, jax.Array)}
-    own = with_values(family, {name: value.reshape(-1, 1) for name, value in values.items()})
-    shape = jnp.broadcast_shapes(*(value.shape for value in values.values()))
+    own, shape = _upright(family)
     e = jnp.sinh(np.linspace(-np.arcsinh(FAR_OUT), np.arcsinh(FAR_OUT), POINTS))[None]
     square, cross = _moments(own, e)
     return square.reshape(shape), cross.reshape(shape)
@@ -582,15 +600,10 @@ class StudentT(AdditiveNoise):
         if not (isinstance(self.df, Unknown) or (np.isfinite(self.df) and self.df > 0)):
             raise InputError(f"StudentT(df={self.df}): the degrees of freedom must be positive")
 
-    def log_likelihood(self, y, predicted, std, period):
-        """Log density of each datum."""
-        r2 = (self.innovation(y, predicted, period) / std) ** 2
+    def log_density(self, e):
+        """Log density of the noise at std 1."""
         constant = gammaln((self.df + 1) / 2) - gammaln(self.df / 2) - 0.5 * _functions(self.df).log(self.df * np.pi)
-        return constant - jnp.log(std) - 0.5 * (self.df + 1) * jnp.log1p(r2 / self.df)
-
-    def score(self, y, predicted, std, period):
-        """Derivative of the log density by the predicted value."""
-        return self.weight(y, predicted, std, period) * self.innovation(y, predicted, period)
+        return constant - 0.5 * (self.df + 1) * jnp.log1p(e**2 / self.df)
 
     def weight(self, y, predicted, std, period):
         """Positive curvature used by a step: an outlying datum counts less."""
@@ -599,15 +612,6 @@ class StudentT(AdditiveNoise):
     def information(self, predicted, std):
         """Expected information about the predicted value."""
         return (self.df + 1) / (self.df + 3) * jnp.ones_like(predicted) / std**2
-
-    def level_score(self, y, predicted, std, period):
-        """One plus the derivative of the log density by log std."""
-        r2 = self.innovation(y, predicted, period) ** 2
-        return self.weight(y, predicted, std, period) * r2
-
-    def reliance(self, y, predicted, std, period):
-        """Weight of each datum over that of one without residual."""
-        return 1.0 / (1.0 + (self.innovation(y, predicted, period) / std) ** 2 / self.df)
 
     @property
     def rejects(self) -> float:
@@ -842,6 +846,9 @@ class Heard(AdditiveNoise):
     A floor that nobody knows is None: a problem then takes it from its table (`found`).
     """
 
+    score, weight, level_score = Family.score, Family.weight, Family.level_score
+    reliance, rejects = Family.reliance, Family.rejects
+
     floor: float | None = None
 
     def __post_init__(self):
@@ -880,15 +887,6 @@ class Heard(AdditiveNoise):
         """Draw what reaches the receiver, heard or not."""
         return predicted + std * jax.random.normal(key, predicted.shape, predicted.dtype)
 
-    def reliance(self, y, predicted, std, period):
-        """One: every datum counts alike."""
-        return jnp.ones_like(predicted)
-
-    @property
-    def rejects(self) -> float:
-        """Zero: no datum is rejected."""
-        return 0.0
-
     def _log_normal(self, y, predicted, std):
         """Log density of a value, heard or not."""
         return -0.5 * (((y - predicted) / std) ** 2 + np.log(2 * np.pi)) - jnp.log(std)
@@ -926,10 +924,6 @@ class Censored(Heard):
         nothing = log_ndtr(self._below(predicted, std))
         return jnp.where(y <= self.known(), nothing, self._log_normal(y, predicted, std))
 
-    def score(self, y, predicted, std, period):
-        """Derivative by the predicted value."""
-        return jnp.where(y <= self.known(), -_mills(self._below(predicted, std)), (y - predicted) / std) / std
-
     def weight(self, y, predicted, std, period):
         """Curvature, which is positive."""
         a = self._below(predicted, std)
@@ -941,11 +935,6 @@ class Censored(Heard):
         a = self._below(predicted, std)
         density = jnp.exp(-0.5 * a**2) / np.sqrt(2 * np.pi)
         return jnp.maximum(ndtr(-a) + a * density + density * _mills(a), SMALLEST) / std**2
-
-    def level_score(self, y, predicted, std, period):
-        """One plus the derivative by log std."""
-        a = self._below(predicted, std)
-        return jnp.where(y <= self.known(), 1.0 - a * _mills(a), ((y - predicted) / std) ** 2)
 
     def sample(self, key, predicted, std):
         """Draw what is reported: the floor where nothing is heard."""
@@ -979,24 +968,11 @@ class Truncated(Heard):
         """Log density of each datum, given that it was heard."""
         return self._log_normal(y, predicted, std) - log_ndtr(self._above(predicted, std))
 
-    def score(self, y, predicted, std, period):
-        """Derivative by the predicted value."""
-        return ((y - predicted) / std - _mills(self._above(predicted, std))) / std
-
-    def weight(self, y, predicted, std, period):
-        """Curvature, which is positive."""
-        return self.information(predicted, std)
-
     def information(self, predicted, std):
         """Expected information about the predicted value."""
         u = self._above(predicted, std)
         ratio = _mills(u)
         return jnp.maximum(1.0 - ratio * (u + ratio), SMALLEST) / std**2
-
-    def level_score(self, y, predicted, std, period):
-        """One plus the derivative by log std."""
-        u = self._above(predicted, std)
-        return ((y - predicted) / std) ** 2 + u * _mills(u)
 
     def sample(self, key, predicted, std):
         """Draw values above the floor around the predicted ones, by the inverse of their distribution function."""
@@ -1012,7 +988,7 @@ class Truncated(Heard):
 
 
 @dataclass(frozen=True)
-class Bernoulli:
+class Bernoulli(Family):
     """A yes-or-no channel (1 or 0): the sensor function returns the log odds of 1; `std` has no meaning."""
 
     def innovation(self, y, predicted, period):
@@ -1023,40 +999,13 @@ class Bernoulli:
         """Log probability of each datum."""
         return y * jax.nn.log_sigmoid(predicted) + (1 - y) * jax.nn.log_sigmoid(-predicted)
 
-    def score(self, y, predicted, std, period):
-        """Derivative of the log probability by the log odds."""
-        return self.innovation(y, predicted, period)
-
-    def weight(self, y, predicted, std, period):
-        """Positive curvature used by a step."""
-        return self.information(predicted, std)
-
     def information(self, predicted, std):
         """Expected information about the log odds."""
         return jax.nn.sigmoid(predicted) * jax.nn.sigmoid(-predicted)
 
-    def level_score(self, y, predicted, std, period):
-        """There is no level: one, so that nothing is learnt of it."""
-        return jnp.ones_like(predicted)
-
-    def reliance(self, y, predicted, std, period):
-        """One: every datum counts alike."""
-        return jnp.ones_like(predicted)
-
-    @property
-    def rejects(self) -> float:
-        """Zero: no datum is rejected."""
-        return 0.0
-
     def sample(self, key, predicted, std):
         """Draw ones and zeros."""
         return jax.random.bernoulli(key, jax.nn.sigmoid(predicted)).astype(predicted.dtype)
-
-    emit = sample
-
-    def reported(self, y):
-        """All of it."""
-        return y
 
     def check(self, y):
         """Which values are legal: 0 and 1."""

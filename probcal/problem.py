@@ -9,7 +9,7 @@ from fnmatch import fnmatchcase
 from numbers import Real
 from os import PathLike
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -17,6 +17,7 @@ import numpy as np
 from probcal.clocks import CLOCK
 from probcal.errors import InputError, nearest
 from probcal.labels import NOBODY
+from probcal.lazy import pd
 from probcal.linalg import handedness
 from probcal.model.epochs import Epoch, merged
 from probcal.model.model import TILTED, Mixing, Model, Recursion, Tail, Tilt, at_rest
@@ -57,9 +58,6 @@ from probcal.table import (
     unit_factor,
 )
 from probcal.types import float64
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,6 +265,17 @@ class Problem:
         """Stated positions of all nodes (a path's points for a moving one), shape (points, d)."""
         return positions_of(self.network)
 
+    def _with(self, **parts: Any) -> Problem:
+        """A copy with other parts."""
+        other = copy(self)
+        vars(other).update(parts)
+        return other
+
+    def _compiled(self) -> Problem:
+        """The problem with its arrays made anew."""
+        self._compile()
+        return self
+
     def rebuild(self, data: Any = None, **changes: Any) -> Problem:
         """The same problem with other data, another network or other fixed biases."""
         settings: dict[str, Any] = {
@@ -319,10 +328,7 @@ class Problem:
         """The same problem, whose clocks that run count from a time in s on, by default that of the first row."""
         if begin == self.begin or not self.clocks.any():
             return self
-        other = copy(self)
-        other.begin = begin
-        other._compile()
-        return other
+        return self._with(begin=begin)._compiled()
 
     @float64
     def at_times(self, moved: np.ndarray, timed: dict[str, float]) -> Problem:
@@ -332,10 +338,7 @@ class Problem:
         """
         if np.array_equal(moved, self.moved):
             return self
-        other = copy(self)
-        other.moved, other.timed = moved, timed
-        other._compile()
-        return other
+        return self._with(moved=moved, timed=timed)._compiled()
 
     def lateness(self, z: Any) -> np.ndarray:
         """Seconds (N,) from where each row is taken to where its clock puts it at biases z (M,)."""
@@ -406,10 +409,8 @@ class Problem:
                     own = channel.turned(value[mine, j])
                     column[mine] = own / unit_factor(data.table, name, units[name], channel.unit)
                 frame[frame.columns[names.index(name)]] = column
-        other = copy(self)
-        other.measurements = replace(data, value=value, table=replace(data.table, frame=frame))
-        other.model = self.model.with_values(y)
-        return other
+        measured = replace(data, value=value, table=replace(data.table, frame=frame))
+        return self._with(measurements=measured, model=self.model.with_values(y))
 
     def target(self, name: str) -> Target:
         """Motion and start of a target by name."""
@@ -422,9 +423,7 @@ class Problem:
 
     def with_tilt(self, tilt: Tilt) -> Problem:
         """The same problem with a term of the log-likelihood of its biases beside that of the rows."""
-        other = copy(self)
-        other.model = self.model.with_tilt(tilt)
-        return other
+        return self._with(model=self.model.with_tilt(tilt))
 
     @property
     def tilted(self) -> bool:
@@ -438,19 +437,11 @@ class Problem:
 
     def at_measured(self) -> Problem:
         """The same problem with growing stds at the measured values, for starts; itself where none grows."""
-        if (model := at_measured(self.model)) is self.model:
-            return self
-        other = copy(self)
-        other.model = model
-        return other
+        return self if (model := at_measured(self.model)) is self.model else self._with(model=model)
 
     def with_mixing(self, weights: Mixing) -> Problem:
         """The same problem with other precisions (E,) of the process noises that are not Gaussian."""
-        if not self.model.tailed:
-            return self
-        other = copy(self)
-        other.model = self.model.with_mixing(weights)
-        return other
+        return self._with(model=self.model.with_mixing(weights)) if self.model.tailed else self
 
     def loosened(self) -> Problem | None:
         """The same problem with motions of a linear form that hold its own loosely; None where one has none."""
@@ -465,9 +456,7 @@ class Problem:
 
     def seen(self) -> Problem:
         """The same problem where states are what rows see of them, (E, n) whatever the motion."""
-        other = copy(self)
-        other.model = self.model.seen()
-        return other
+        return self._with(model=self.model.seen())
 
     @float64
     def later(self, data: Any, sizes: tuple[int, ...] | None = None) -> Epoch:
@@ -477,12 +466,9 @@ class Problem:
         `sizes` are the most rows of each block at an epoch, by default those of this problem. Raises `InputError` for
         a row that is not later, for a new target, and where an epoch has more rows than its size.
         """
-        other = copy(self)
-        other.measurements = self._at_epochs(measure(read_table(data), self.network))
-        other.moved = np.zeros(len(other.measurements.time))
-        other.silent = _check_rows(other.measurements, self.network)
+        measured = self._at_epochs(measure(read_table(data), self.network))
+        silent = _check_rows(measured, self.network)
         last = {name: float(time[-1]) for name, time in self.tracks()}
-        measured = other.measurements
         for name in measured.target_names:
             if name not in last:
                 raise InputError(
@@ -496,6 +482,7 @@ class Problem:
                 f"{measured.table.where(n)}: time {measured.time[n]:g} is not after the last epoch of its target, at"
                 f" {before[n]:g}"
             )
+        other = self._with(measurements=measured, moved=np.zeros(len(measured.time)), silent=silent)
         other._compile(last, further=True)
         slots = {n: k for e in self.epochs for k, n in enumerate(e.members)}
         sizes = self.model.sizes if sizes is None else sizes
@@ -508,10 +495,7 @@ class Problem:
         that is declared. `slots` says which target of its recursion each is. Every sensor type and every form of a
         motion that the rows have must be in this problem. Raises `InputError` as `Problem`.
         """
-        other = copy(self)
-        other.measurements = self._at_epochs(data)
-        other.moved = np.zeros(len(data.time))
-        other.silent = ()
+        other = self._with(measurements=self._at_epochs(data), moved=np.zeros(len(data.time)), silent=())
         other._compile(begun, further=True)
         model, pairs = self._aligned(other, slots)
         found = {(block, r): rows for block, _, r, rows in other.model.each_block(other.row_index)}

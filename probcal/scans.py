@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.network import Network
 from probcal.table import Measurements, Table, header
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 
 @dataclass(frozen=True, eq=False)

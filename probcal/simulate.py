@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ import numpy as np
 from probcal.errors import InputError, nearest
 from probcal.files import write_whole
 from probcal.labels import NOBODY, coordinates, listed, unescaped
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.model import rows
 from probcal.model.sampled import path
 from probcal.network import Network
@@ -25,11 +25,6 @@ from probcal.problem import Epochs, Problem
 from probcal.sensor import Channel
 from probcal.table import Table, csv_text, header, name_as_text, numbers, read_table, unit_factor
 from probcal.types import float64
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 Key = int | jax.Array
 

@@ -11,32 +11,34 @@ from decimal import Decimal
 from numbers import Number
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.labels import NOBODY, check_name, escaped, unescaped
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.network import Network
 from probcal.noise import Bernoulli, Censored, Heard
 from probcal.sensor import Channel, meant_unit
 
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
-
 # unit -> (quantity, factor to its base); offsets do not occur
 UNITS = {
-    "m": ("length", 1.0), "km": ("length", 1e3), "cm": ("length", 1e-2), "mm": ("length", 1e-3),
-    "ft": ("length", 0.3048), "mi": ("length", 1609.344), "nmi": ("length", 1852.0),
-    "rad": ("angle", 1.0), "mrad": ("angle", 1e-3), "deg": ("angle", np.pi / 180), "°": ("angle", np.pi / 180),
-    "s": ("time", 1.0), "ms": ("time", 1e-3), "us": ("time", 1e-6), "ns": ("time", 1e-9), "min": ("time", 60.0),
-    "h": ("time", 3600.0), "m/s": ("speed", 1.0), "km/h": ("speed", 1 / 3.6), "Hz": ("frequency", 1.0),
-    "kHz": ("frequency", 1e3), "dB": ("level", 1.0), "dBm": ("power level", 1.0), "1": ("ratio", 1.0),
-    "%": ("ratio", 1e-2), "T": ("magnetic field", 1.0), "uT": ("magnetic field", 1e-6),
-    "nT": ("magnetic field", 1e-9),
+    unit: (quantity, factor)
+    for quantity, units in {
+        "length": {
+            "m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048, "mi": 1609.344, "nmi": 1852.0,
+        },
+        "angle": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "°": np.pi / 180},
+        "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0},
+        "speed": {"m/s": 1.0, "km/h": 1 / 3.6},
+        "frequency": {"Hz": 1.0, "kHz": 1e3},
+        "level": {"dB": 1.0},
+        "power level": {"dBm": 1.0},
+        "ratio": {"1": 1.0, "%": 1e-2},
+        "magnetic field": {"T": 1.0, "uT": 1e-6, "nT": 1e-9},
+    }.items()
+    for unit, factor in units.items()
 }  # fmt: skip
 BLANK = ("", "nan", "NaN", "NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "None", "-nan")  # cells without a number
 LARGEST = 1e100  # of a cell: what is computed from it, squares included, stays finite

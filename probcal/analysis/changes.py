@@ -21,7 +21,7 @@ from probcal.labels import check_name, label_parts, listed, step_of
 from probcal.linalg import marginalise
 from probcal.results.answer import HALF
 from probcal.results.modes import rivals
-from probcal.results.read import stated_values
+from probcal.results.read import listed_in, stated_values
 from probcal.results.schema import INTERVAL, held_biases, matrix_of
 from probcal.status import Status
 
@@ -213,7 +213,7 @@ def _alike(both: pieces.Pieces, moved: int, free: dict[int, pieces.Contrast], in
 
 def _contradictions(tree: xr.DataTree) -> str:
     """How many biases of a fit drift or are in conflict, where its assessment was kept; empty where none."""
-    words = tree["verdict"].to_dataset()["verdict"].values.tolist() if "verdict" in tree.children else []
+    words = listed_in(tree, "verdict", "verdict")
     counts = {word: words.count(word) for word in ("drifting", "conflicting")}
     return ", ".join(f"{count} {word}" for word, count in counts.items() if count)
 

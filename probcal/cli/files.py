@@ -3,13 +3,9 @@
 import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from probcal.files import Outputs, write_whole
-
-if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
+from probcal.lazy import pd, xr
 
 
 def write_csv(frame: "pd.DataFrame", path: Path) -> None:
@@ -56,12 +52,13 @@ def write_result(
 
 def say_findings(tree: "xr.DataTree", most: int | None = None, where: str = "") -> None:
     """Print the sentences of a result, all or the first, and where the others are; nothing where it has none."""
-    if "finding" in tree.children:
-        sentences = tree["finding"].to_dataset()["sentence"].values.tolist()
-        shown = sentences[:most]
-        left = len(sentences) - len(shown)
-        for sentence in [*shown, *([f"and {left} more {where}"] if left else [])]:
-            print(f"- {sentence}")
+    from probcal.results.read import listed_in  # it loads xarray
+
+    sentences = listed_in(tree, "finding", "sentence")
+    shown = sentences[:most]
+    left = len(sentences) - len(shown)
+    for sentence in [*shown, *([f"and {left} more {where}"] if left else [])]:
+        print(f"- {sentence}")
 
 
 def say_written(files: Sequence[Path]) -> None:

@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 from probcal.cli.options import check_files
 from probcal.errors import FitError, InputError, nearest
+from probcal.lazy import xr
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from probcal.inference.method import Method
     from probcal.network import Network
     from probcal.priors import Prior

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.geometry import slopes
 from probcal.labels import AXES
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.motion.base import GAUSSIAN, Component
 from probcal.motion.components import blocks
 from probcal.noise import Level, check_driving, check_level
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ from probcal.files import write_whole
 from probcal.plots.base import figure_of
 from probcal.report import tables, words
 from probcal.results.drifts import drift_table
+from probcal.results.read import listed_in
 from probcal.results.schema import EVIDENCES, evidence_in
 from probcal.status import INVALID, Status
 
@@ -94,7 +95,7 @@ def _render(tree: xr.DataTree, static: bool) -> str:
         nothing=words.nothing_found(tree),
         total=tree["calibration"].sizes["bias_label"],
         known=any(row.true for row in shown),
-        notes=[*words.sentences(str(attrs["message"])), *tables.noted(tree)],
+        notes=[*words.sentences(str(attrs["message"])), *listed_in(tree, "finding", "sentence")],
         directions=tables.directions(tree),
         columns=columns,
         rows=rows,

@@ -79,11 +79,6 @@ def weighted(tree: xr.DataTree) -> bool:
     return "residual" in tree.children and bool((tree["residual"]["weight"] < 1).any())
 
 
-def noted(tree: xr.DataTree) -> list[str]:
-    """Sentences of an assessment."""
-    return tree["finding"].to_dataset()["sentence"].values.tolist() if "finding" in tree.children else []
-
-
 def directions(tree: xr.DataTree) -> list[str]:
     """Sentences of the weak directions."""
     if "direction" not in tree.children:

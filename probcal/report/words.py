@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from markupsafe import Markup, escape
 
-from probcal.results.read import known_truth, summary
+from probcal.results.read import known_truth, listed_in, summary
 from probcal.status import INVALID, Status
 
 NONE = "–"  # where there is no finite number
@@ -81,14 +81,9 @@ def headline(tree: xr.DataTree) -> str:
     return f"The fit {status.said}: {told}{_judged(tree)}."
 
 
-def _verdicts(tree: xr.DataTree) -> list[str]:
-    """Verdict of every bias; empty where the fit was not assessed."""
-    return tree["verdict"].to_dataset()["verdict"].values.tolist() if "verdict" in tree.children else []
-
-
 def _judged(tree: xr.DataTree) -> str:
     """How many biases have which verdict."""
-    count = Counter(_verdicts(tree))
+    count = Counter(listed_in(tree, "verdict", "verdict"))
     known = dict.fromkeys(("determined", *ASIDE, "weak", "prior only", *sorted(count)))
     told = [f"{count[name]} {name}" for name in known if count[name]]
     return f"; {', '.join(told)}" if told else ""
@@ -96,14 +91,14 @@ def _judged(tree: xr.DataTree) -> str:
 
 def nothing_found(tree: xr.DataTree) -> str:
     """What it means that no bias is shown: how many the data tell of, or that nobody asked."""
-    verdicts = _verdicts(tree)
+    verdicts = listed_in(tree, "verdict", "verdict")
     told = f"the data determine {verdicts.count('determined')} of {len(verdicts)}"
     return f"; {told if verdicts else 'the fit was not assessed'}"
 
 
 def in_conflict(tree: xr.DataTree) -> bool:
     """Whether some bias conflicts with the model or drifts."""
-    return not set(ASIDE).isdisjoint(_verdicts(tree))
+    return not set(ASIDE).isdisjoint(listed_in(tree, "verdict", "verdict"))
 
 
 def bias_frame(tree: xr.DataTree) -> Any:

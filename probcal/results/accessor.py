@@ -5,16 +5,11 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING
 
-from probcal.lazy import Later
+from probcal.lazy import pd, xr
 from probcal.results.display import install
 
 if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
-
     from probcal.simulate import Truth
-else:
-    xr = Later("xarray")
 
 
 class Accessor:

@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from probcal.lazy import xr
 from probcal.results.schema import matrix_of
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from probcal.model.rows import Linearised
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from probcal.gaussian.draws import many_data, residuals
 from probcal.gaussian.mode import Point
 from probcal.labels import AXES
-from probcal.lazy import Later
+from probcal.lazy import xr
 from probcal.model.motions import level_values
 from probcal.modes.mirrors import SAME
 from probcal.results.accessor import register
@@ -28,16 +28,12 @@ from probcal.results.groups import (
     gather,
     track_groups,
 )
-from probcal.results.modes import ELSEWHERE, LEAST, REPORTED, Mode, mode_group, unlike
+from probcal.results.modes import ELSEWHERE, LEAST, REPORTED, ModeRow, mode_group, unlike
 from probcal.results.schema import BOUND, EVIDENCE, INTERVAL, RESULTS_VERSION
 from probcal.table import first_date
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from probcal.problem import Problem
-else:
-    xr = Later("xarray")
 
 SHARP = 256  # steps to which the spread of a log-likelihood over the draws is rounded, so that its file is small
 AT_ONCE = 10_000  # data that are rounded at once
@@ -241,7 +237,7 @@ def _origin(problem: Problem) -> dict[str, str]:
     return {"time_origin": date} if date else {}
 
 
-def modes_of(answer: Answer) -> tuple[list[Mode], list[Sequence[Any]]]:
+def modes_of(answer: Answer) -> tuple[list[ModeRow], list[Sequence[Any]]]:
     """All answers of a fit and the states (E, n) of each, the reported one first, then others by gain.
 
     No other function reads what an `Answer` carries beside its own posterior.
@@ -256,15 +252,15 @@ def modes_of(answer: Answer) -> tuple[list[Mode], list[Sequence[Any]]]:
         return {} if k is None else _of_start(k, optima.pop(k))
 
     known = {"status": str(answer.status)} | started(posterior.point)
-    modes, states = [Mode(REPORTED, REPORTED, mean, 0.0, **known)], [posterior.states]
+    modes, states = [ModeRow(REPORTED, REPORTED, mean, 0.0, **known)], [posterior.states]
     for other in sorted(answer.mirrors, key=lambda other: -other.gain):
         known = {"status": other.status} | started(other.point)
-        modes.append(Mode(other.name, other.kind, mean + other.shift * scales, other.gain, **known))
+        modes.append(ModeRow(other.name, other.kind, mean + other.shift * scales, other.gain, **known))
         states.append(other.point.states)
     for k, one in sorted(optima.items(), key=lambda item: -item[1].objective):
         bias = one.posterior.here[0] * scales
         gain = one.objective - answer.objective if one.method == answer.method else np.nan
-        modes.append(Mode(ELSEWHERE, unlike(bias, modes, sd), bias, gain, **_of_start(k, one)))
+        modes.append(ModeRow(ELSEWHERE, unlike(bias, modes, sd), bias, gain, **_of_start(k, one)))
         states.append(one.posterior.states)
     return modes, states
 

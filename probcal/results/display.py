@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import html
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from probcal.lazy import xr
 from probcal.status import INVALID
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 ROWS = 40  # biases that are shown
 SHOWN = ("bias", "unit", "mean", "sd", "lower", "upper", "gamma", "status", "verdict")
@@ -21,8 +19,6 @@ def install() -> None:
     shell: Any = found.get_ipython() if found is not None and hasattr(found, "get_ipython") else None
     if shell is None:
         return
-    import xarray as xr
-
     formatters = shell.display_formatter.formatters
     formatters["text/html"].for_type(xr.DataTree, as_html)
     formatters["text/plain"].for_type(xr.DataTree, lambda tree, printer, cycle: printer.text(as_text(tree)))

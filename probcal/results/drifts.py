@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pandas as pd
 
 from probcal.errors import checked
 from probcal.labels import step_of
+from probcal.lazy import xr
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import held_biases
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 
 @checked

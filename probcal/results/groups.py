@@ -10,17 +10,13 @@ import numpy as np
 
 from probcal.geodesy import GEODETIC
 from probcal.labels import AXES
-from probcal.lazy import Later
+from probcal.lazy import xr
 from probcal.model.model import Recursion
 from probcal.results.views import view_variables
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from probcal.gaussian.mode import Point
     from probcal.problem import Problem
-else:
-    xr = Later("xarray")
 
 
 class Band(NamedTuple):

@@ -6,13 +6,13 @@ import hashlib
 from collections.abc import Iterator, Mapping
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from probcal.errors import InputError, checked
 from probcal.files import write_whole
-from probcal.lazy import Later
+from probcal.lazy import xr
 from probcal.results.accessor import register
 from probcal.results.blocks import SensorBlocks
 from probcal.results.modes import upgraded
@@ -28,11 +28,6 @@ from probcal.results.schema import (
     Member,
 )
 from probcal.status import Status
-
-if TYPE_CHECKING:
-    import xarray as xr
-else:
-    xr = Later("xarray")
 
 SMALL = 1024  # bytes up to which an array of a file has no chunk of its own
 SEAL = b"probcal sha256:"  # behind the content of a file, before its digest

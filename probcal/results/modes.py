@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from probcal.labels import AXES, SCENE, coordinates
-from probcal.lazy import Later
+from probcal.labels import coordinates
+from probcal.lazy import xr
 from probcal.results.schema import DIFFERENT, RESULTS_VERSION, evidence_in
-
-if TYPE_CHECKING:
-    import xarray as xr
-else:
-    xr = Later("xarray")
 
 REPORTED = "reported"  # kind of the answer that the rest of the tree describes
 AGAIN = "again"  # kind of an answer from a further start that stands before it in the group
 REJECTED = "rejected"  # kind of another answer from a further start, far below the reported one or invalid
 ELSEWHERE = "found from another start"
 LEAST = 0.01  # scales that count as an sd where that is smaller
-ROUNDED = 1e-6  # sd within which version 3 wrote one answer twice
 
 
-class Mode(NamedTuple):
+class ModeRow(NamedTuple):
     """One answer of a fit."""
 
     name: str  # of what was reflected or exchanged
@@ -41,18 +35,18 @@ def apart(bias: np.ndarray, other: np.ndarray, sd: np.ndarray) -> np.ndarray:
     return np.abs(bias - other) / np.maximum(sd, 1e-12)
 
 
-def unlike(bias: np.ndarray, others: Sequence[Mode], sd: np.ndarray) -> str:
+def unlike(bias: np.ndarray, others: Sequence[ModeRow], sd: np.ndarray) -> str:
     """The kind of a further answer that no reader shall count: one that stands among others, or a worse one."""
     near = (np.max(apart(bias, other.bias, sd), initial=0.0) <= DIFFERENT for other in others)
     return AGAIN if any(near) else REJECTED
 
 
-def mode_group(modes: Sequence[Mode], sd: np.ndarray, coords: Mapping[str, Any], attrs: Mapping[str, Any]) -> Any:
+def mode_group(modes: Sequence[ModeRow], sd: np.ndarray, coords: Mapping[str, Any], attrs: Mapping[str, Any]) -> Any:
     """The variables of some modes; `sd` (M,) are those of the reported one, the first.
 
     The attribute `same` has the nats within which an answer is as good, `objective` the name of that variable.
     """
-    columns = {name: [getattr(own, name) for own in modes] for name in Mode._fields}
+    columns = {name: [getattr(own, name) for own in modes] for name in ModeRow._fields}
     names, bias = columns.pop("name"), np.stack(columns.pop("bias"))
     values: dict[str, Any] = {name: ("mode", np.array(own)) for name, own in columns.items()}
     values["bias"] = (("mode", "bias_label"), bias)
@@ -85,49 +79,44 @@ def started(tree: xr.DataTree) -> xr.Dataset | None:
 
 
 def upgraded(tree: xr.DataTree) -> xr.DataTree:
-    """A tree of version 3 in the form of today: its groups `mirror` and `optimum` become the group `mode`."""
+    """A tree of version 3 in the form of today: its groups `mirror` and `optimum` become the group `mode`.
+
+    The answers of its starts stand there as version 3 had them, the reported one and the mirrors once more.
+    """
     if tree.attrs.get("results_version") != 3:
         return tree
     group = tree["calibration"].to_dataset()
-    sd, labels = group["sd"].values, group["bias_label"].values
-    least = np.maximum(sd, LEAST * group["scale"].values)
-    modes = [Mode(REPORTED, REPORTED, group["mean"].values, 0.0, str(tree.attrs["status"]))]
-    attrs: dict[str, Any] = {"same": 0.0, "objective": "objective"}
-    if mirrored := "mirror" in tree.children:
+    sd, least = group["sd"].values, LEAST * group["scale"].values
+    modes = [ModeRow(REPORTED, REPORTED, group["mean"].values, 0.0, str(tree.attrs["status"]))]
+    attrs, found = {"same": 0.0, "objective": "objective"}, dict[str, Any]()
+    if "mirror" in tree.children:
         old = tree["mirror"].to_dataset()
         attrs["same"] = old.attrs["same"]
-        kinds = old["kind"].values if "kind" in old else np.full(old.sizes["mirror"], SCENE)
-        rows = zip(old["mirror"].values, kinds, old["bias"].values, old["gain"].values, strict=True)
-        modes += [Mode(str(name), str(kind), bias, float(gain)) for name, kind, bias, gain in rows]
-    further = _from_starts(tree["optimum"].to_dataset(), modes, least, attrs) if "optimum" in tree.children else []
-    coords = {name: own for name, own in group.coords.items() if own.dims == ("bias_label",)} | {"bias_label": labels}
-    found = {"/": mode_group([*modes, *further], sd, coords, attrs)}
-    for name, node in tree["mirror/track"].children.items() if mirrored else ():
-        own, track = node.to_dataset(inherit=False), tree.children["track"].children[name].to_dataset()
-        here = track["mean"].sel(component=coordinates(track["component"].values)).values[None]
-        unknown = np.full((len(further), *here.shape[1:]), np.nan)
-        places = np.concatenate([here, own["position"].values, unknown])
-        where = {"time": own["time"].values, "axis": list(AXES[: here.shape[2]])}
-        position = {"position": (("mode", "time", "axis"), places)}
-        found[f"track/{name}"] = xr.Dataset(position, coords=where, attrs=own.attrs)
-    for name in ("mirror", "optimum"):
-        if name in tree.children:
-            del tree[name]
-    tree["mode"] = xr.DataTree.from_dict(found)
+        rows = zip(*(old[name].values for name in ("mirror", "kind", "bias", "gain")), strict=True)
+        modes += [ModeRow(str(name), str(kind), bias, float(gain)) for name, kind, bias, gain in rows]
+        for target, node in tree["mirror/track"].children.items():
+            own, track = node.to_dataset(inherit=False), tree.children["track"].children[target].to_dataset()
+            here = track["mean"].sel(component=coordinates(track["component"].values)).values
+            places = ("mode", "time", "axis"), np.concatenate([here[None], own["position"].values])
+            found[f"track/{target}"] = xr.Dataset(
+                {"position": places}, {name: own[name] for name in ("time", "axis")}, own.attrs
+            )
+        del tree["mirror"]
+    if "optimum" in tree.children:
+        old = tree["optimum"].to_dataset()
+        name = attrs["objective"] = evidence_in(old) or "objective"
+        first = float(old[name][0])
+        for k, bias in enumerate(old["bias"].values):
+            score, kind = float(old[name][k]), unlike(bias, modes, np.maximum(sd, least))
+            known: dict[str, Any] = {
+                "status": str(old["status"].values[k]),
+                "start": int(old["start"][k]),
+                "objective": score,
+            }
+            modes.append(ModeRow(ELSEWHERE, kind, bias, score - first, **known))
+        del tree["optimum"]
+    found = {name: own.pad({"mode": (0, len(modes) - own.sizes["mode"])}) for name, own in found.items()}
+    coords = {"bias_label": group["bias_label"].values}
+    tree["mode"] = xr.DataTree.from_dict({"/": mode_group(modes, sd, coords, attrs), **found})
     tree.attrs["results_version"] = RESULTS_VERSION
     return tree
-
-
-def _from_starts(old: xr.Dataset, modes: list[Mode], sd: np.ndarray, attrs: dict[str, Any]) -> list[Mode]:
-    """The answers of a group `optimum` that are none of some modes; those that are one are noted there."""
-    attrs["objective"] = evidence_in(old) or "objective"
-    scores, found = old[attrs["objective"]].values, list[Mode]()
-    for bias, status, start, score in zip(*(old[n].values for n in ("bias", "status", "start")), scores, strict=True):
-        known: dict[str, Any] = {"status": str(status), "start": int(start), "objective": float(score)}
-        same = (np.max(apart(bias, own.bias, sd), initial=0.0) < ROUNDED and own.start < 0 for own in modes)
-        if (k := next((k for k, one in enumerate(same) if one), None)) is not None:
-            modes[k] = modes[k]._replace(**known)
-        else:
-            gain = float(score - scores[0]) if modes[0].start >= 0 else np.nan
-            found.append(Mode(ELSEWHERE, unlike(bias, [*modes, *found], sd), bias, gain, **known))
-    return found

@@ -12,14 +12,12 @@ import numpy as np
 
 from probcal.errors import InputError, checked
 from probcal.labels import NOBODY
+from probcal.lazy import pd, xr
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import MORE, SUMMARY, held_biases
 from probcal.status import INVALID
 
 if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
-
     from probcal.network import Network
     from probcal.problem import Epochs, Problem
 
@@ -48,10 +46,13 @@ def frame_of(tree: xr.DataTree, group: str, *columns: str) -> Any:
     return data[chosen].to_dataframe()[chosen] if chosen else data.to_dataframe()
 
 
+def listed_in(tree: xr.DataTree, group: str, name: str) -> list[Any]:
+    """The values of a variable of a group; none where the tree has no such group."""
+    return tree[group].to_dataset()[name].values.tolist() if group in tree.children else []
+
+
 def known_truth(tree: xr.DataTree) -> pd.Series:
     """The true biases that a scored tree knows, by label; empty where it was not scored."""
-    import pandas as pd  # loaded where a table is made
-
     known = tree["truth"].to_dataset()["bias"].to_series() if "truth" in tree.children else pd.Series(dtype=float)
     return known.rename(index=str)
 
@@ -100,8 +101,6 @@ def tracks(tree: xr.DataTree) -> pd.DataFrame:
     >>> tracks(tree).columns[:3].tolist()
     ['time', 'target', 'position_x']
     """
-    import pandas as pd  # loaded where a table is made
-
     parts = []
     for target, group in each_target(tree):
         columns: dict[str, np.ndarray] = {"time": group["time"].values, "target": np.full(group.sizes["time"], target)}

@@ -9,17 +9,13 @@ import numpy as np
 
 from probcal.errors import checked
 from probcal.labels import NOBODY, coordinates
-from probcal.lazy import Later
+from probcal.lazy import xr
 from probcal.results.alignment import Alignment
 from probcal.results.alignment import align as laid_on
 from probcal.results.read import each_target, frame_of
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from probcal.simulate import Truth
-else:
-    xr = Later("xarray")
 
 
 def position_rmse(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> tuple[float, float] | None:
