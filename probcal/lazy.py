@@ -72,8 +72,8 @@ class Later:
         return getattr(found, name)
 
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # slow to load: options are checked, and help is printed, without them
     import pandas as pd
     import xarray as xr
 else:
-    pd, xr = Later("pandas"), Later("xarray")  # slow to load, and options are checked and help is printed without
+    pd, xr = Later("pandas"), Later("xarray")

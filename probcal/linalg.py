@@ -189,12 +189,14 @@ def factor_and_inverse(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     first, first_inverse = factor_and_inverse(matrix[:h, :h])
     below = matrix[h:, :h] @ first_inverse.T
     last, last_inverse = factor_and_inverse(matrix[h:, h:] - below @ below.T)
-    corner = jnp.zeros((h, n - h), matrix.dtype)
-    inverse_below = -(last_inverse @ below) @ first_inverse
-    return (
-        jnp.block([[first, corner], [below, last]]),
-        jnp.block([[first_inverse, corner], [inverse_below, last_inverse]]),
-    )
+    lower = jnp.block([[first, jnp.zeros((h, n - h), matrix.dtype)], [below, last]])
+    return lower, _inverse_of_halves(first_inverse, below, last_inverse)
+
+
+def _inverse_of_halves(first: jax.Array, below: jax.Array, last: jax.Array) -> jax.Array:
+    """Inverse of a lower triangular matrix by those of its diagonal blocks and what stands below them."""
+    corner = jnp.zeros((len(first), len(last)), below.dtype)
+    return jnp.block([[first, corner], [-(last @ below) @ first, last]])
 
 
 def inverse_lower(matrix: jax.Array) -> jax.Array:
@@ -203,8 +205,7 @@ def inverse_lower(matrix: jax.Array) -> jax.Array:
     if n <= BASE:
         return solve_triangular(matrix, jnp.eye(n, dtype=matrix.dtype), lower=True)
     h = n // 2
-    first, last = inverse_lower(matrix[:h, :h]), inverse_lower(matrix[h:, h:])
-    return jnp.block([[first, jnp.zeros((h, n - h), matrix.dtype)], [-(last @ matrix[h:, :h]) @ first, last]])
+    return _inverse_of_halves(inverse_lower(matrix[:h, :h]), matrix[h:, :h], inverse_lower(matrix[h:, h:]))
 
 
 def solve_positive(matrix: jax.Array, right: jax.Array) -> jax.Array:

@@ -184,7 +184,7 @@ HALF = 0.5  # reliance below which a datum counts as rejected
 
 
 class Family:
-    """What a noise family answers; `y`, `predicted`, `std` are arrays of one shape, `period` a number or None.
+    """A noise family; `y`, `predicted`, `std` are arrays of one shape, `period` a number or None.
 
     The derivatives are those of its log-likelihood. A family that says no more relies on every datum.
     """

@@ -262,7 +262,8 @@ def _beside_mirrors(answer: Answer, method: Maximiser, context: Context) -> Answ
         if one is not best:
             (name, kind), place = side if side[0] else way, one.posterior
             shift, status = place.summary.mean - mean, str(one.status)
-            mirrors.append(Mirrored(name, _weight(one) - first - gain, place.point, shift, kind, status))
+            less = _weight(one) - first - gain
+            mirrors.append(Mirrored(name, less, place.point, shift, kind, status))
     mirrors += [o._replace(gain=o.gain - gain, shift=np.asarray(o.point.z) - mean) for o in unfitted]
     mirrors = sorted((other for other in mirrors if other.gain > -NEAR), key=lambda other: -other.gain)
     best = best.noted(unseen, motion=answer.motion, optima=answer.optima, best=answer.best, mirrors=tuple(mirrors))

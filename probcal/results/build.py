@@ -238,9 +238,9 @@ def _origin(problem: Problem) -> dict[str, str]:
 
 
 def modes_of(answer: Answer) -> tuple[list[ModeRow], list[Sequence[Any]]]:
-    """All answers of a fit and the states (E, n) of each, the reported one first, then others by gain.
+    """All answers of a fit and their states (E, n), the reported one first, then others by gain.
 
-    No other function reads what an `Answer` carries beside its own posterior.
+    No other function reads what an `Answer` carries besides its own posterior.
     """
     scales, posterior, optima = answer.problem.scales, answer.posterior, dict(enumerate(answer.optima))
     mean, sd = (own * scales for own in posterior.here)

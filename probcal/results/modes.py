@@ -1,4 +1,4 @@
-"""The group `mode` of a tree: every answer of a fit, the reported one first, and the same of a file of version 3."""
+"""The group `mode` of a tree: every answer of a fit, and the same of a file of version 3."""
 
 from __future__ import annotations
 
@@ -36,15 +36,18 @@ def apart(bias: np.ndarray, other: np.ndarray, sd: np.ndarray) -> np.ndarray:
 
 
 def unlike(bias: np.ndarray, others: Sequence[ModeRow], sd: np.ndarray) -> str:
-    """The kind of a further answer that no reader shall count: one that stands among others, or a worse one."""
+    """The kind of an answer that no reader shall count: one that came back, or a worse one."""
     near = (np.max(apart(bias, other.bias, sd), initial=0.0) <= DIFFERENT for other in others)
     return AGAIN if any(near) else REJECTED
 
 
-def mode_group(modes: Sequence[ModeRow], sd: np.ndarray, coords: Mapping[str, Any], attrs: Mapping[str, Any]) -> Any:
+def mode_group(
+    modes: Sequence[ModeRow], sd: np.ndarray, coords: Mapping[str, Any], attrs: Mapping[str, Any]
+) -> xr.Dataset:
     """The variables of some modes; `sd` (M,) are those of the reported one, the first.
 
-    The attribute `same` has the nats within which an answer is as good, `objective` the name of that variable.
+    The attribute `same` has the nats within which an answer is as good, `objective` the name of
+    that variable.
     """
     columns = {name: [getattr(own, name) for own in modes] for name in ModeRow._fields}
     names, bias = columns.pop("name"), np.stack(columns.pop("bias"))
@@ -55,7 +58,7 @@ def mode_group(modes: Sequence[ModeRow], sd: np.ndarray, coords: Mapping[str, An
 
 
 def rivals(tree: xr.DataTree) -> xr.Dataset:
-    """The other answers of a fit that fit about as well as the reported one, the best first; `number` is their row."""
+    """The other answers that fit about as well as the reported one; `number` is their row."""
     group = tree["mode"].to_dataset()
     group = group.assign(number=("mode", np.arange(group.sizes["mode"])))
     return group.isel(mode=~np.isin(group["kind"].values, (REPORTED, AGAIN, REJECTED)))
@@ -68,7 +71,7 @@ def alike(tree: xr.DataTree) -> xr.Dataset:
 
 
 def started(tree: xr.DataTree) -> xr.Dataset | None:
-    """The answers of several starts, with `far`, the largest change of a bias there in scales; None of one start."""
+    """The answers of several starts; `far` is the largest change of a bias there, in scales."""
     group = tree["mode"].to_dataset()
     from_start = group["start"].values >= 0
     if not from_start.any():
@@ -79,44 +82,43 @@ def started(tree: xr.DataTree) -> xr.Dataset | None:
 
 
 def upgraded(tree: xr.DataTree) -> xr.DataTree:
-    """A tree of version 3 in the form of today: its groups `mirror` and `optimum` become the group `mode`.
+    """A tree of version 3 in the form of today: the groups `mirror` and `optimum` become `mode`.
 
-    The answers of its starts stand there as version 3 had them, the reported one and the mirrors once more.
+    The answers of its starts stand there as version 3 had them, the reported one once more.
     """
     if tree.attrs.get("results_version") != 3:
         return tree
     group = tree["calibration"].to_dataset()
-    sd, least = group["sd"].values, LEAST * group["scale"].values
-    modes = [ModeRow(REPORTED, REPORTED, group["mean"].values, 0.0, str(tree.attrs["status"]))]
-    attrs, found = {"same": 0.0, "objective": "objective"}, dict[str, Any]()
+    mean, sd = group["mean"].values, group["sd"].values
+    modes = [ModeRow(REPORTED, REPORTED, mean, 0.0, str(tree.attrs["status"]))]
+    attrs, tracks = {"same": 0.0, "objective": "objective"}, dict[str, Any]()
     if "mirror" in tree.children:
         old = tree["mirror"].to_dataset()
         attrs["same"] = old.attrs["same"]
         rows = zip(*(old[name].values for name in ("mirror", "kind", "bias", "gain")), strict=True)
         modes += [ModeRow(str(name), str(kind), bias, float(gain)) for name, kind, bias, gain in rows]
         for target, node in tree["mirror/track"].children.items():
-            own, track = node.to_dataset(inherit=False), tree.children["track"].children[target].to_dataset()
-            here = track["mean"].sel(component=coordinates(track["component"].values)).values
-            places = ("mode", "time", "axis"), np.concatenate([here[None], own["position"].values])
-            found[f"track/{target}"] = xr.Dataset(
-                {"position": places}, {name: own[name] for name in ("time", "axis")}, own.attrs
-            )
+            tracks[f"track/{target}"] = _with_reported(node, tree.children["track"].children[target])
         del tree["mirror"]
     if "optimum" in tree.children:
         old = tree["optimum"].to_dataset()
         name = attrs["objective"] = evidence_in(old) or "objective"
-        first = float(old[name][0])
-        for k, bias in enumerate(old["bias"].values):
-            score, kind = float(old[name][k]), unlike(bias, modes, np.maximum(sd, least))
-            known: dict[str, Any] = {
-                "status": str(old["status"].values[k]),
-                "start": int(old["start"][k]),
-                "objective": score,
-            }
-            modes.append(ModeRow(ELSEWHERE, kind, bias, score - first, **known))
+        least = np.maximum(sd, LEAST * group["scale"].values)
+        columns = (old[key].values for key in ("bias", "status", "start", name))
+        for bias, status, start, score in zip(*columns, strict=True):
+            kind, gain = unlike(bias, modes, least), float(score - old[name].values[0])
+            modes.append(ModeRow(ELSEWHERE, kind, bias, gain, str(status), int(start), float(score)))
         del tree["optimum"]
-    found = {name: own.pad({"mode": (0, len(modes) - own.sizes["mode"])}) for name, own in found.items()}
+    tracks = {name: own.pad({"mode": (0, len(modes) - own.sizes["mode"])}) for name, own in tracks.items()}
     coords = {"bias_label": group["bias_label"].values}
-    tree["mode"] = xr.DataTree.from_dict({"/": mode_group(modes, sd, coords, attrs), **found})
+    tree["mode"] = xr.DataTree.from_dict({"/": mode_group(modes, sd, coords, attrs), **tracks})
     tree.attrs["results_version"] = RESULTS_VERSION
     return tree
+
+
+def _with_reported(mirrored: xr.DataTree, track: xr.DataTree) -> xr.Dataset:
+    """Places of a target in the answers of version 3, those of the reported one first."""
+    own, mean = mirrored.to_dataset(inherit=False), track.to_dataset()["mean"]
+    here = mean.sel(component=coordinates(mean["component"].values)).values
+    places = ("mode", "time", "axis"), np.concatenate([here[None], own["position"].values])
+    return xr.Dataset({"position": places}, {name: own[name] for name in ("time", "axis")}, own.attrs)

@@ -1,14 +1,17 @@
 """The form of a tree of results: version, columns, and what readers of a file take for granted.
 
-Group `mode` (dimension `mode`) has all answers of a fit, the reported one first: its name, `kind` ("reported"; "scene",
-"piece", "node" or "start" of another answer, by what it differs; "again" of a further start that came back to one of
-them; "rejected" of one that ended far below or invalid), `gain` (evidence or log density less that of the reported
-answer, nats), `bias` and `apart` (its distance in sd) by bias, `status` of the fit from there (empty where the answer
-was found and not fitted), `start` (the number of the start that led to it, -1 of none) and its `objective`. An answer
-whose gain is above minus the attribute `same` fits as well. Of several answers `mode/track/<target>` has the places. A
-reader takes words that it does not know, as of a verdict or a kind, for what they are: texts.
+Group `mode` (dimension `mode`) has all answers of a fit, the reported one first: its name, `kind`
+("reported"; "scene", "piece", "node" or "start" of another answer, by what it differs; "again" of a
+further start that came back to one of them; "rejected" of one that ended far below or invalid),
+`gain` (evidence or log density less that of the reported answer, nats), `bias` and `apart` (its
+distance in sd) by bias, `status` of the fit from there (empty where the answer was found and not
+fitted), `start` (the number of the start that led to it, -1 of none) and its `objective`. An answer
+whose gain is above minus the attribute `same` fits as well. Of several answers
+`mode/track/<target>` has the places. A reader takes words that it does not know, as of a verdict or
+a kind, for what they are: texts.
 
-A file of version 3 has groups `mirror` and `optimum` for this one; `load` turns them into it (`results.modes`).
+A file of version 3 has groups `mirror` and `optimum` for this one; `load` turns them into it
+(`results.modes`).
 """
 
 from collections.abc import Container, Hashable
@@ -19,7 +22,7 @@ import numpy as np
 from probcal.errors import InputError
 
 INTERVAL = 0.89  # probability of lower to upper
-# of the groups and variables that a fit writes; a reader takes files of version 3 too and refuses any other
+# of what a fit writes; a reader takes files of version 3 too and refuses any other
 RESULTS_VERSION = 4
 MORE = ("r_hat", "ess", "ess_tail", "inclusion", "included", "contraction")  # columns of samplers
 SUMMARY = ("bias", "unit", "scale", "mean", "sd", "lower", "upper", "gamma")
