@@ -19,8 +19,6 @@ from probcal.sensor import Bias, Channel, sensor
 CLOSE = 1e-3  # m, distance below which a level or a direction no longer changes
 DIPOLE = 100.0  # nT m^3 / (A m^2), the magnetic constant over 4 pi
 TOUCH = 0.1  # m, distance below which the field of a dipole no longer grows
-DIRECTION = Channel("rad", std=np.deg2rad(1.0), wrap=True)
-FREE_SPACE = Bias("1", 0.5, nominal=2.0, shared="type")  # exponent of the spreading
 EDGE = np.deg2rad(80.0)  # angle off its axis beyond which the image of a pinhole camera is continued linearly
 
 
@@ -107,15 +105,15 @@ def tdoa(target, first, second, *, difference_offset=Bias("m", 1.0)):
     return dict(difference=ranges + second.clock - first.clock + difference_offset)
 
 
-@sensor(azimuth=DIRECTION)
+@sensor(azimuth=Channel("rad", std=np.deg2rad(1.0), wrap=True))
 def doa(target, pose):
     """Direction of arrival in the plane, from the node's heading (thesis 2.10-2.11)."""
     return dict(azimuth=bearing(target.position - pose.position) - pose.heading)
 
 
 @sensor(
-    azimuth=DIRECTION,
-    elevation=DIRECTION,
+    azimuth=Channel("rad", std=np.deg2rad(1.0), wrap=True),
+    elevation=Channel("rad", std=np.deg2rad(1.0), wrap=True),
 )
 def doa_3d(target, pose):
     """Azimuth and elevation in the node's own axes (heading, pitch, roll)."""
@@ -132,8 +130,8 @@ def radar(target, pose, *, range_offset=Bias("m", 10.0)):
 
 @sensor(
     range=Channel("m", std=10.0),
-    azimuth=DIRECTION,
-    elevation=DIRECTION,
+    azimuth=Channel("rad", std=np.deg2rad(1.0), wrap=True),
+    elevation=Channel("rad", std=np.deg2rad(1.0), wrap=True),
 )
 def radar_3d(target, pose, *, range_offset=Bias("m", 10.0), range_scale=Bias("1", 0.01)):
     """Radar in 3-D with the biases of a real one (thesis 2.3.4): slant range, azimuth and elevation in its own axes.
@@ -147,7 +145,7 @@ def radar_3d(target, pose, *, range_offset=Bias("m", 10.0), range_scale=Bias("1"
 
 
 @sensor(level=Channel("dB", std=2.0))
-def rss(target, pose, *, gain=Bias("dB", 3.0), exponent=FREE_SPACE):
+def rss(target, pose, *, gain=Bias("dB", 3.0), exponent=Bias("1", 0.5, nominal=2.0, shared="type")):
     """Received signal strength: power - 10 exponent log10 r + gain (Paper A 6, its log(1 - gain) written in dB).
 
     A gain common to all sensors is a source power: the gains are told apart by the start of `power`.
@@ -156,13 +154,13 @@ def rss(target, pose, *, gain=Bias("dB", 3.0), exponent=FREE_SPACE):
 
 
 @sensor(level=Channel("dB", std=2.0))
-def rss_slope(target, pose, *, gain=Bias("1", 0.05), exponent=FREE_SPACE):
+def rss_slope(target, pose, *, gain=Bias("1", 0.05), exponent=Bias("1", 0.5, nominal=2.0, shared="type")):
     """Received signal strength: (1 - gain) power - 10 exponent log10 r, the gain a slope (thesis 2.13)."""
     return dict(level=(1 - gain) * target.power - exponent * _loss(target.position - pose.position))
 
 
 @sensor(level_difference=Channel("dB", std=2.0))
-def rss_difference(target, first, second, *, exponent=FREE_SPACE):
+def rss_difference(target, first, second, *, exponent=Bias("1", 0.5, nominal=2.0, shared="type")):
     """Level at the second node minus that at the first, in which the unknown power cancels (thesis 2.3.5).
 
     The gains are the nodes': Node(..., gain=0.0, scale={"gain": Bias("dB", 3.0)}); one common to all cancels too.

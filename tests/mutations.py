@@ -186,8 +186,8 @@ MUTATIONS = [
     # table.py
     Mutation("np.arange(number, len(frame) + number)", "np.arange(1, len(frame) + 1)", "test_table.py test_cli.py"),
     Mutation("in ((name, value), (f\"{name}_std\", std)):", "in ((name, value),):", "test_table.py"),
-    Mutation("(\"length\", 1852.0)", "(\"length\", 1853.0)", "test_table.py"),
-    Mutation("(\"length\", 1609.344)", "(\"length\", 1609.0)", "test_table.py"),
+    Mutation("\"nmi\": 1852.0", "\"nmi\": 1853.0", "test_table.py"),
+    Mutation("\"mi\": 1609.344", "\"mi\": 1609.0", "test_table.py"),
     Mutation("return size / UNITS[wanted][1]", "return size * UNITS[wanted][1]", "test_table.py"),
     # nodes.py
     Mutation("@ earth_axes(self.latitude, self.longitude).T", "@ earth_axes(self.latitude, self.longitude)", "test_nodes.py"),
