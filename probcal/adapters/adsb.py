@@ -5,20 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from probcal.adapters.shared import check_frame, instant, reports
 from probcal.errors import InputError, nearest
 from probcal.geodesy import LocalFrame
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.table import Table, name_as_text, numbers, read_table, split_header, unit_factor
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 ALSO = {  # quantity -> names in files of OpenSky, its API, and others; unit that counts where a header states none
     "target": ("icao24", "hex", "icao", "target"),

@@ -7,16 +7,14 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from probcal.adapters.shared import KNOT, check_frame, extra, file_bytes, instant, reports
 from probcal.errors import InputError
 from probcal.geodesy import LocalFrame
-
-if TYPE_CHECKING:
-    import pandas as pd
+from probcal.lazy import pd
 
 SENTENCE = re.compile(r"[!$][A-Z]{2}VD[MO],[^*]*\*[0-9A-Fa-f]{2}")
 TAG = re.compile(r"\\([^\\]*)\\")

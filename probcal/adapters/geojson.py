@@ -6,7 +6,7 @@ import json
 from collections import Counter
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,15 +15,9 @@ from probcal.errors import InputError
 from probcal.files import parsed_json, write_whole
 from probcal.geodesy import GEODETIC, LocalFrame, check_place
 from probcal.labels import AXES
-from probcal.lazy import Later
+from probcal.lazy import pd, xr
 from probcal.linalg import handedness, spectrum
 from probcal.results.read import each_target
-
-if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
-else:
-    pd = Later("pandas")
 
 NAMES = ("target", "name", "id")  # properties that name a target, the first that is there
 TIMES = ("time", "timestamp", "datetime")

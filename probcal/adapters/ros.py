@@ -7,20 +7,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from probcal.adapters.shared import SECOND, check_frame, extra, since
 from probcal.errors import InputError, nearest
 from probcal.geodesy import LocalFrame
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.table import UNITS, split_header
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 LOCAL = ("local_x", "local_y", "local_z")  # of a NavSatFix, in the frame
 TURNS = ("yaw", "pitch", "roll")  # of a quaternion

@@ -7,19 +7,14 @@ from datetime import datetime
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.geodesy import LocalFrame
 from probcal.labels import AXES
-from probcal.lazy import Later
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
+from probcal.lazy import pd
 
 SECOND = 1_000_000_000  # ns
 LATEST = 146 * 365 * 86400 * SECOND  # ns before and after 1970 of what counts as an instant

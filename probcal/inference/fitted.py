@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from probcal.gaussian.engine import Engine, Expansion, Factors
 from probcal.gaussian.information import at_levels
 from probcal.gaussian.mode import Point
 from probcal.gaussian.places import tilt_at
-from probcal.lazy import Later
+from probcal.lazy import pd, xr
 from probcal.linalg import invert
 from probcal.model.model import Recursion
 from probcal.model.motions import level_logs
@@ -28,13 +28,6 @@ from probcal.results.answer import blocks_under
 from probcal.results.blocks import SensorBlocks
 from probcal.results.groups import datum_of, gather, weights_of_tails
 from probcal.results.read import each_track, saved_by_epoch
-
-if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
-else:
-    pd, xr = Later("pandas"), Later("xarray")
-
 
 COLUMNS = 16  # bias directions that are filtered together
 

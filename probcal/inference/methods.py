@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from probcal.errors import InputError
 from probcal.inference.collapsed import Collapsed
@@ -19,16 +18,11 @@ from probcal.inference.method import Method
 from probcal.inference.nuts import NUTS
 from probcal.inference.run import Maximiser
 from probcal.inference.svi import SVI
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.priors import PRIORS, AnyPrior, BernoulliGaussian, Flat, Gaussian, Laplace, Prior, as_prior
 from probcal.problem import Problem, check_linear
 from probcal.wings import METHODS as OF_WINGS
 from probcal.wings import WithWings
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 # names on the command line: method, and the prior it means where that is not the method's first
 METHODS = WithWings[tuple[Method, Prior | None]](

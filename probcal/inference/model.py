@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ from probcal.gaussian.mode import Point, driven_states
 from probcal.inference.hierarchy import Hierarchy, Phi, hierarchy_of
 from probcal.inference.pose import pilot
 from probcal.inference.posed import Form, Posed
+from probcal.lazy import xr
 from probcal.model import rows
 from probcal.model.model import Model
 from probcal.model.rows import Block, Rows
@@ -34,9 +35,6 @@ from probcal.priors import PRIORS, AnyPrior, Flat, Horseshoe, Precision, as_prio
 from probcal.problem import Problem, check_linear
 from probcal.results.read import apply
 from probcal.types import float64
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 
 def suffix(problem: Problem, r: int) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +14,7 @@ from probcal.gaussian.information import at_levels
 from probcal.gaussian.tails import settle
 from probcal.inference.method import ParticleSmoother
 from probcal.inference.widen import judge_tracks
+from probcal.lazy import xr
 from probcal.modes import automatic_start
 from probcal.modes.grid import grid_start
 from probcal.problem import Problem, check_linear
@@ -23,9 +24,6 @@ from probcal.results.read import apply
 from probcal.simulate import Key, as_key
 from probcal.types import float64
 from probcal.wings import of_wing
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 
 @float64

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.lazy import Later
+from probcal.lazy import xr
 from probcal.particles.ensemble import filter_ensemble
 from probcal.particles.particles import Particles
 from probcal.particles.weighted import FILTERS, Paths, log_likelihood_at, prepared, status_of_tracks
@@ -18,11 +18,6 @@ from probcal.results.groups import by_target
 from probcal.results.read import apply
 from probcal.simulate import Key, as_key
 from probcal.types import float64
-
-if TYPE_CHECKING:
-    import xarray as xr
-else:
-    xr = Later("xarray")
 
 THOUSAND = Particles(1000)
 

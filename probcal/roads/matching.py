@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.labels import AXES
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.roads.extra import networkx, shapely
 from probcal.roads.network import RoadNetwork
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 MATCHED, FAR, UNREACHED, AGAIN = "matched", "far from roads", "unreachable", "matched after a gap"
 BACK = 3.0  # std that a target may seem to go back on a one-way edge

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.labels import AXES
-from probcal.lazy import Later
+from probcal.lazy import xr
 from probcal.linalg import singular
 from probcal.problem import Problem
 from probcal.simulate import Truth
-
-if TYPE_CHECKING:
-    import xarray as xr
-else:
-    xr = Later("xarray")
 
 MODELS = ("M0", "M1", "M2")
 POWERS = ("target", "time")

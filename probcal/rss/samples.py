@@ -4,17 +4,11 @@ from __future__ import annotations
 
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.lazy import Later
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
+from probcal.lazy import pd
 
 ORDER = 4  # of the Butterworth band-pass, run forwards and backwards
 QUIET = 1e-30  # mean square below which a window holds nothing

@@ -2,20 +2,14 @@
 
 from collections.abc import Sequence
 from os import PathLike
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from probcal.errors import InputError, nearest
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.network import Network
 from probcal.noise import Censored
 from probcal.table import read_table
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 
 def with_silence(

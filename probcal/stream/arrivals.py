@@ -6,13 +6,13 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from probcal.errors import InputError
 from probcal.labels import AXES, NOBODY
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.model.epochs import Epoch, merged, slots
 from probcal.model.motions import Area, linear_of, start_of
 from probcal.modes.grid import candidates
@@ -23,11 +23,6 @@ from probcal.plausible import implausible
 from probcal.problem import Problem, check_linear, declared_target
 from probcal.stream.counted import COUNTED, STREAMS, Counted, Stream, first_key
 from probcal.table import Table, header, measure, name_as_text, names_as_text
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 ONLY = "target"  # the target of a table that names none
 

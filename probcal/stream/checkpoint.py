@@ -10,14 +10,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from functools import reduce
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
 
 from probcal.errors import InputError
 from probcal.inference.manifest import check_same
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.model.motions import Area
 from probcal.results.io import SEAL
 from probcal.stream.arrivals import CarriedTarget
@@ -25,11 +25,6 @@ from probcal.stream.online import Jump, Online, ParticleFilter
 from probcal.stream.surveillance import BATCH, Event
 from probcal.table import Table, measure
 from probcal.types import float64
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 VERSION = 4
 LARGEST = 2**63  # above every count, and every integer that an array holds

@@ -8,16 +8,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from probcal.lazy import Later
+from probcal.lazy import pd, xr
 from probcal.table import Measurements
 
 if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
-
     from probcal.network import Network
-else:
-    pd = Later("pandas")
 
 COUNTED = "the calibration has counted this row"
 STREAMS = "streams_counted"  # attribute of a tree: a list of `Stream` as JSON

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ import numpy as np
 from probcal.gaussian.mode import Point
 from probcal.inference.mixture import draw_along, gaussian, gaussian_biases
 from probcal.inference.widen import widened_by
+from probcal.lazy import pd, xr
 from probcal.linalg import invert, solve_square
 from probcal.modes import automatic_start
 from probcal.modes.grid import track_mode
@@ -26,10 +27,6 @@ from probcal.stream.mistakes import mistake
 from probcal.stream.surveillance import Surveillance
 from probcal.table import Table
 from probcal.types import float64
-
-if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
 
 
 class FilteredStream(Protocol):

@@ -22,12 +22,11 @@ from probcal.errors import InputError
 from probcal.files import cannot_write
 from probcal.inference.manifest import MARK, OVERWRITE, STORE, clear_store, store_mark
 from probcal.inference.storage import Storage
-from probcal.lazy import Later
+from probcal.lazy import Later, xr
 from probcal.results.schema import INTERVAL
 from probcal.status import Status
 
 if TYPE_CHECKING:
-    import xarray as xr
     import zarr
     from zarr import codecs
 else:

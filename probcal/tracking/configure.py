@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from probcal.errors import FitError
 from probcal.inference.method import Context, Method
 from probcal.inference.solve import solve
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.priors import Prior
 from probcal.problem import Problem
 from probcal.tracking.objects import Objects, track_objects
 from probcal.tracking.poses.propagation import Beliefs, propagate_beliefs
 from probcal.tracking.rates import rated
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 WIDER = 4.0  # times the variance of a belief that is granted at the start
 ALIKE = 0.02  # by which the weight of no pair may change from one round to the next

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.lazy import Later
+from probcal.lazy import pd, xr
 from probcal.problem import Problem
 from probcal.tracking.objects import Objects
 from probcal.tracking.poses.propagation import Beliefs
 from probcal.tracking.scan import View, Watch, alone, detected, watch_of
-
-if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
-else:
-    pd, xr = Later("pandas"), Later("xarray")
 
 LOOKS, UNSEEN = 8.0, 0.1  # detections expected of an object, and the share below which it is not seen
 

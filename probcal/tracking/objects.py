@@ -4,22 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.problem import Problem
 from probcal.tracking.bernoulli import Step, filter_tracks
 from probcal.tracking.entry import asked
 from probcal.types import float64
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 LEAST = 0.02  # share of a detection below which it is not listed
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -20,17 +20,12 @@ from jax.scipy.special import gammaln, logsumexp, xlogy
 
 from probcal import linalg
 from probcal.errors import InputError
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.problem import Problem
 from probcal.tracking.entry import asked
 from probcal.tracking.scan import Scan, View, Watch, detected, present
 from probcal.tracking.update import TINY, Biases, Chances, births, rows_from, updated, updated_by_points
 from probcal.types import float64
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 Kind = Literal["phd", "cphd"]
 Update = Literal["extended", "cubature"]

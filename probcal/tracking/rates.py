@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from probcal.detection import Detection
-from probcal.lazy import Later
+from probcal.lazy import pd, xr
 from probcal.noise import Unknown
 from probcal.problem import Problem
 from probcal.tracking.groups import looks_of
 from probcal.tracking.objects import Objects
-
-if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
-else:
-    pd = Later("pandas")
 
 
 def rated(problem: Problem, objects: Objects, z: np.ndarray) -> tuple[Problem, pd.DataFrame]:

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from probcal.errors import InputError
 from probcal.labels import AXES
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.linalg import least_squares, pseudo_inverse
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 FEW = 5  # instants that two tracks share at least
 RIVAL = 0.8  # of the seconds explained by the best frame that make another one a rival

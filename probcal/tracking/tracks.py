@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from probcal.errors import FitError
+from probcal.lazy import xr
 from probcal.problem import Problem, check_linear
 from probcal.results.read import apply
 from probcal.tracking.groups import with_objects
 from probcal.tracking.objects import track_objects
 from probcal.tracking.rates import of_calibration
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 
 def track_detections(

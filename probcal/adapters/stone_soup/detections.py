@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime, timedelta
 from itertools import groupby
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,16 +22,11 @@ from probcal.adapters.stone_soup.measurement import (
 )
 from probcal.errors import InputError, nearest
 from probcal.labels import AXES
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.network import Network
 from probcal.noise import Heard, Unknown
 from probcal.sensor import Channel, Sensor
 from probcal.table import header, measure, read_table
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 NATIVE = {  # what the measurement models of Stone Soup measure, in their order
     "Cartesian2DToBearing": ("bearing",),

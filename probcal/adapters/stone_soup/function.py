@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,17 +12,12 @@ import numpy as np
 
 from probcal.errors import InputError, nearest
 from probcal.labels import AXES
-from probcal.lazy import Later
+from probcal.lazy import xr
 from probcal.model.rows import pose_entries, pose_vector
 from probcal.network import ANGLES, BiasRecord, Network
 from probcal.noise import Bernoulli, Unknown, guess_of
 from probcal.sensor import Channel, Sensor, SensorType
 from probcal.types import PoseView, TargetView
-
-if TYPE_CHECKING:
-    import xarray as xr
-else:
-    xr = Later("xarray")
 
 Places = tuple[tuple[str, int | tuple[int, ...]], ...]  # where the components of a state stand in its vector
 Mapped = Sequence[int] | Mapping[str, int | Sequence[int]] | None

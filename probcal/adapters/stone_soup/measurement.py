@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,15 +18,10 @@ from probcal.adapters.stone_soup.function import (
     channel_stds,
 )
 from probcal.errors import InputError, nearest
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.network import Network
 from probcal.sensor import Channel, Sensor
 from probcal.table import name_as_text
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 EPOCH = datetime(1970, 1, 1)  # of detections and tracks whose start nobody states
 

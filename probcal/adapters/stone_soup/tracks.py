@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from datetime import datetime, timedelta
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,14 +18,8 @@ from probcal.adapters.stone_soup.measurement import (
 )
 from probcal.errors import InputError, nearest
 from probcal.labels import AXES
-from probcal.lazy import Later
+from probcal.lazy import pd, xr
 from probcal.results.read import each_target
-
-if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
-else:
-    pd = Later("pandas")
 
 POSITION = tuple(f"position_{axis}" for axis in AXES)
 

@@ -9,19 +9,13 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from probcal.lazy import Later
 from probcal.tracking.poses.messages import Belief, Edge, Kernels, Normals
 from probcal.tracking.poses.search import Peak, Potential, search
 from probcal.tracking.poses.vertices import Graph
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 DECISIVE = 10.0  # nats of evidence over no common object from which a pair tells how it stands
 STRONG = 0.2  # of the most evidence of a hop that is enough to be placed in it

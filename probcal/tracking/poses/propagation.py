@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from probcal.errors import InputError, nearest
-from probcal.lazy import Later
+from probcal.lazy import pd
 from probcal.problem import Problem
 from probcal.tracking.entry import asked, cloud_of
 from probcal.tracking.poses.beliefs import Field, spread_beliefs
@@ -16,11 +16,6 @@ from probcal.tracking.poses.messages import MESSAGES
 from probcal.tracking.poses.separable import TERMS
 from probcal.tracking.poses.vertices import Graph, graph_of
 from probcal.types import float64
-
-if TYPE_CHECKING:
-    import pandas as pd
-else:
-    pd = Later("pandas")
 
 
 @dataclass(frozen=True, eq=False)

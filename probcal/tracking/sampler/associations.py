@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from probcal.errors import InputError
 from probcal.inference.hierarchy import Hierarchy, Phi, hierarchy_of
 from probcal.inference.mixed import R_HAT, mixing
 from probcal.inference.posterior import mixed_of
-from probcal.lazy import Later
+from probcal.lazy import pd, xr
 from probcal.noise import Unknown
 from probcal.priors import PRECISION_BOUNDS, AnyPrior, Gaussian, Prior, as_prior
 from probcal.problem import Problem
@@ -30,12 +30,6 @@ from probcal.tracking.sampler.moves import ALL_SCANS, MOVES, ONE_SCAN, SWAP, TRA
 from probcal.tracking.sampler.sampled import Association, Recording, first_of, places
 from probcal.tracking.scan import View
 from probcal.types import float64
-
-if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
-else:
-    pd, xr = Later("pandas"), Later("xarray")
 
 SWEEP = (SWAP, TRACK, ONE_SCAN, TRACK, ALL_SCANS)  # moves between two draws
 PAIRS = 2000  # of detections and slots, at most
