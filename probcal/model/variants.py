@@ -51,13 +51,13 @@ def aligned(like: Model, later: Model, recursions: Sequence[int | None], targets
     found, rows = [], []
     for part, r, names in like.each_layout(recursions, targets):
         if r is None:
-            found.append(jax.tree.map(lambda leaf: leaf[:0], part))
+            found.append(jax.tree.map(lambda leaf: np.asarray(leaf)[:0], part))
         else:
             mine = later.recursions[r]
             found.append(mine._replace(target=np.asarray(names, int)[np.asarray(mine.target)]))
     own: dict[Any, Rows] = {(block, r): data for block, data, r in later.each_block()}
     for block, data, r in like.each_block():
-        nothing = {name: getattr(data, name)[:0] for name in BY_ROW}
+        nothing = {name: np.asarray(getattr(data, name))[:0] for name in BY_ROW}
         rows.append(own.get((block, recursions[r]), data._replace(**nothing)))
     return replace(like, recursions=tuple(found), rows=tuple(rows))
 

@@ -60,9 +60,9 @@ def _of(model: Model, epochs: Epoch, r: int) -> Targets:
 
 def _alone(model: Model, r: int, blocks: list[int]) -> Model:
     """A model of one target of a recursion, of a single row a block: the numbers of an epoch come with the epoch."""
-    part: Any = jax.tree.map(lambda leaf: leaf[:1], model.recursions[r])
-    rows = [model.rows[b] for b in blocks]
-    rows = [data._replace(**{name: getattr(data, name)[:1] for name in BY_ROW}) for data in rows]
+    part: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[:1], model.recursions[r])
+    every: Any = [model.rows[b] for b in blocks]
+    rows = [data._replace(**{name: np.asarray(getattr(data, name))[:1] for name in BY_ROW}) for data in every]
     moving = np.asarray(model.recursions[r].L)[~np.asarray(model.recursions[r].first)]  # a start needs no density
     rank = bool(handedness(moving).all())
     return replace(

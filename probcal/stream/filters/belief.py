@@ -7,6 +7,7 @@ not grow with the number of targets. Where the biases move, targets get correlat
 dropped; with one target there are none.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -87,6 +88,7 @@ class KeptDatum(NamedTuple):
     slope: jax.Array | None = None  # () change of its prediction, over the std of the noise, by one scale of that
 
 
+@partial(jax.jit, static_argnames="sizes")
 def empty(z: jax.Array, root: jax.Array, sizes: tuple[tuple[int, int], ...], bias: jax.Array) -> Augmented:
     """Biases N(z, root root') before any target, `sizes` (T, n) of each recursion, candidates (C,) by their bias."""
     M, C = z.shape[0], bias.shape[0]

@@ -59,6 +59,7 @@ def ancestors(cloud: Cloud) -> int:
     return len(np.unique(np.asarray(cloud.origin)))
 
 
+@jax.jit
 def bias_moments(cloud: Cloud) -> tuple[jax.Array, jax.Array]:
     """Mean (M,) and covariance (M, M) of the biases over all particles."""
     weight = jnp.exp(cloud.log_weight)
