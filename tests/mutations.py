@@ -133,7 +133,6 @@ MUTATIONS = [
     Mutation("(squares + point.trajectories.square)", "squares", "test_guards.py"),
     # gaussian/jointly.py
     Mutation("slopes.z - model.onto_biases(", "slopes.z + model.onto_biases(", "test_engine.py"),
-    Mutation("own, lin.score - lin.weight * by[:, :, 0]", "own, lin.score", "test_engine.py"),
     # gaussian/draws.py
     Mutation("x[:, :, None] + prior - smooth.states", "x[:, :, None] + prior + smooth.states", "test_exact.py"),
     Mutation("jax.random.normal(key, (count, M)) @ root.T", "jax.random.normal(key, (count, M)) @ root", "test_exact.py"),
@@ -232,13 +231,13 @@ MUTATIONS = [
     # analysis/
     Mutation("(not status.settled, ", "(status is Status.DIVERGED, ", "test_guards.py"),
     Mutation("(gamma + inflation * (1.0 - gamma))", "gamma", "test_assess.py"),
-    Mutation("Refit(-least - 0.5 * volume, square)", "Refit(-least, square)", "test_assess.py"),
+    Mutation("(_logdet(prior, held) - volume) - float(least)", "_logdet(prior, held) - float(least)", "test_assess.py"),
     Mutation("np.where(held, PINNED, 0.0)", "np.where(held, 0.0, 0.0)", "test_assess.py"),
     Mutation("slope[:M] -= prior @ pieces.z", "slope[:M] += prior @ pieces.z", "test_assess.py"),
     Mutation("np.eye(q) + np.ones((q, q))", "np.eye(q)", "test_assess.py"),
     Mutation("expected = np.maximum(whole - used, 1e-9)", "expected = np.maximum(whole, 1e-9)", "test_assess.py"),
     Mutation("u**2 + variance - 1.0", "u**2 - 1.0", "test_asked_levels.py"),
-    Mutation("change: np.ndarray = steps[1] - steps[0]", "change: np.ndarray = 0.0 * steps[1]", "test_asked_levels.py"),
+    Mutation("change: np.ndarray = steps[1][: len(steps[0])] - steps[0]", "change: np.ndarray = 0.0 * steps[1]", "test_asked_levels.py"),
     Mutation("and again.sum() < TOGETHER * count", "", "test_asked_levels.py"),
     Mutation("slice(row, row + size), slice(row, row + width))) row += size", "slice(row, row + size), slice(row, row + width)))\n        row += width", "test_tails.py"),
     Mutation("* (n + 2) / n", "* n / (n + 2)", "test_assess.py"),

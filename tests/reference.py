@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from probcal.gaussian.engine import Estimate, Sampled, Spread
-from probcal.gaussian.jointly import Embedded, Variables
+from probcal.gaussian.jointly import Variables
 from probcal.gaussian.linearised import given_biases, linearise_rows
 from probcal.gaussian.mode import eliminate_rows, factors, find_tracks, log_likelihood, mixing_gain
 from probcal.model.model import scaled
@@ -502,13 +502,6 @@ class Naive:
 
     def weighed(self, weights):
         return Naive(self.model.weighted(weights), self.point, scaled(self.rows, weights))
-
-    def embedded(self, factors, columns):
-        C = np.concatenate([np.asarray(own).reshape(-1, own.shape[2]) for own in columns])
-        across, P = self.H.T @ (self.w[:, None] * C), self.covariance(factors)
-        slope = self.pulled.copy()
-        slope[self.U :] += np.asarray(factors.pull(self.point.z))
-        return Embedded(C.T @ (self.w[:, None] * C) - across.T @ P @ across, C.T @ self.s - across.T @ P @ slope)
 
 
 @jax.jit

@@ -30,7 +30,8 @@ HOOKS += ["update", "under", "float", "int"]
 VALUES = {"problem": "Problem", "online": "Online", "motion": "Motion", "sensor_type": "SensorType"}  # their class
 NOISY = ["ConstantVelocity", "ConstantAcceleration", "CoordinatedTurn", "RandomWalk", "White", "Known"]
 CALLED = {  # values that a filled-in name may have
-    "own.family": NOISY, "method.name": ["EA", "MAP"], "name": HOOKS, "type(self).__name__": ["Gaussian", "ARD"],
+    "type(component).__name__": NOISY, "method.name": ["EA", "MAP"], "name": HOOKS,
+    "type(self).__name__": ["Gaussian", "ARD"],
     "type(prior).__name__": ["Horseshoe", "BernoulliGaussian"], "method": ["EA", "MAP"],
 }  # fmt: skip
 

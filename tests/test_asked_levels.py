@@ -163,19 +163,19 @@ def test_what_moves_where_others_may_change_is_that_of_a_fit_where_they_do():
     table = jumped(3.0)
     problem, _ = world(table=table)
     fit = take_up(problem, probcal.fit(problem, MAP(trajectory="joint")))
-    late = (problem.measurements.time >= 20.0).astype(int)
-    divided = float64(pieces.divide)(fit, late, 2)
+    late = (problem.measurements.time >= 20.0).astype(float)
+    divided = float64(pieces.divide)(fit, late[:, None])
     m = problem.labels.index("b.shift")
     moved = pieces.freed(divided, [(m, np.array([[0.0], [1.0]]))]) * problem.scales
     free = deepcopy(divided)
     prior = np.eye(len(problem.labels))
     prior[m, m] = 0.0
     M = len(prior)
-    to = np.concatenate([np.tile(np.eye(M), (2, 1)), np.kron([[0.0], [1.0]], np.eye(M)[:, [m]])], 1)
+    to = np.eye(2 * M)[:, [*range(M), M + m]]
     here = np.asarray(fit.point.z)
     K, z = to.T @ free.information @ to, np.r_[here, 0.0]
     K[:M, :M] += prior
-    right = to.T @ (free.score + free.information @ np.tile(here, 2))
+    right = to.T @ (free.score + free.information @ np.r_[here, np.zeros(M)])
     np.testing.assert_allclose(moved, (np.linalg.solve(K, right) - z)[:M] * problem.scales, atol=1e-6)
     stepped, _ = world(table=table, drift=Drift([0.0, 20.0], scale=100.0))
     tree = probcal.fit(stepped, MAP(trajectory="joint"))

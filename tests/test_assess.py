@@ -33,6 +33,8 @@ from probcal import (
 )
 from probcal.analysis import leave, pieces
 from probcal.analysis.assess import assess
+from probcal.analysis.check import Checked, check
+from probcal.analysis.findings import Finding
 from probcal.analysis.nees import of_biases
 from probcal.geometry import bearing, norm
 from probcal.inference import residuals
@@ -183,7 +185,7 @@ def test_the_change_between_pieces_is_generalised_least_squares(linear):
     with jax.enable_x64(True):
         fit = take_up(problem, tree)
         piece = np.digitize(problem.measurements.time, [edge, last])
-        three = pieces.divide(fit, piece, 3)
+        three = pieces.divide(fit, np.eye(3)[piece][:, 1:])
     found = pieces.contrasts(three, np.eye(3)[:, 1:])
     assert len(found) >= 4
     for m, contrast in found.items():
@@ -198,12 +200,35 @@ def test_the_change_between_pieces_is_generalised_least_squares(linear):
         change, _ = regress([first, m])
         np.testing.assert_allclose(contrast.estimate, change, rtol=0, atol=1e-6 * max(np.abs(change).max(), 1.0))
     with jax.enable_x64(True):
-        halves = pieces.divide(fit, (piece > 0).astype(int), 2)
+        halves = pieces.divide(fit, (piece > 0)[:, None].astype(float))
     later = np.array([[0.0], [1.0], [1.0]])
     for m, contrast in pieces.contrasts(three, later).items():
         directly = pieces.contrasts(halves, np.eye(2)[:, 1:])[m]
         np.testing.assert_allclose(contrast.estimate, directly.estimate, rtol=1e-7)
         np.testing.assert_allclose(contrast.information, directly.information, rtol=1e-7)
+
+
+def test_a_check_of_ones_own_is_one_function(monkeypatch):
+    """Its group, findings, doubts and remarks are those of the result; what it explains is not said; needs are met."""
+    problem, tree, _, _ = assessed("plane")
+
+    @check("answer")
+    def mine(case):
+        group = xr.Dataset({"data": len(case.fit.data)})
+        said = [Finding("mine", "fit", "a sentence of one's own")]
+        return Checked({"mine": group}, said, {"drifting": {0: "it wanders"}}, ["sign"], remarks={1: "; as ever"})
+
+    sign = check()(lambda case: Checked(findings=[Finding("sign", "fit", "a sign of it")]))
+    unmet = check("truth")(lambda case: 1 / 0)
+    monkeypatch.setattr(sys.modules[assess.__module__], "CHECKS", {"sign": sign, "mine": mine, "unmet": unmet})
+    found = assess(problem, tree)
+    assert int(found["mine"]["data"]) == tree["observed_data"].sizes["datum"]
+    verdict, finding = found["verdict"].to_dataset(), found["finding"].to_dataset()
+    assert verdict["verdict"].values[0] == "drifting"
+    assert verdict["reason"].values[0] == "it wanders"
+    assert str(verdict["reason"].values[1]).endswith("; as ever")
+    assert finding["kind"].values.tolist()[:2] == ["drifting", "mine"]
+    assert "sign" not in finding["kind"].values
 
 
 def test_psis_is_that_of_arviz():
@@ -377,7 +402,7 @@ def test_targets_that_a_sensor_does_not_see_tell_nothing_of_it(judged):
     problem = problem.rebuild(frame)
     tree = probcal.fit(problem, EA())
     with jax.enable_x64(True):
-        divided = pieces.divide(take_up(problem, tree), problem.measurements.target, 2)
+        divided = pieces.divide(take_up(problem, tree), problem.measurements.target[:, None].astype(float))
     found = pieces.contrasts(divided, np.array([[0.0], [1.0]]))
     labels = {problem.labels[m] for m in found}
     assert "west.range_offset" not in labels
@@ -637,7 +662,7 @@ def test_a_bias_without_spread_has_no_error_to_be_judged_but_another_value(true,
     both = {"bias_label": list("abcd"), "bias_label_other": list("abcd")}
     values = {"mean": ("bias_label", np.zeros(4)), "scale": ("bias_label", np.full(4, 2.0))}
     group = xr.Dataset(values | {"covariance": (tuple(both), matrix)}, both)
-    value, count, lower, upper = of_biases(xr.DataTree.from_dict({"calibration": group}), Truth(biases=true), 0.01)
+    value, count, lower, upper = of_biases(xr.DataTree.from_dict({"calibration": group}), Truth(biases=true))
     assert value == pytest.approx(expected)
     assert count == rank
     assert 0 <= lower <= upper < 20

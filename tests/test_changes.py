@@ -109,7 +109,7 @@ def test_a_change_of_the_order_of_its_scale_is_taken_first():
     per_piece, after = np.array([0.01, 100.0]), np.array([100.0, 0.9])
     both = pieces.Pieces(np.diag(np.tile(per_piece, 2)), np.concatenate([np.zeros(2), per_piece * after]), np.eye(2),
                          np.zeros(2))  # fmt: skip
-    found = pieces.changing(both, {"second": np.array([[0.0], [1.0]])}, {"second": np.ones(2)}, lambda _: 10.0)
+    found = pieces.changing(both, {"second": np.array([[0.0], [1.0]])}, {"second": np.ones(2)}, 2)
     assert [one.bias for one in found] == [1, 0]
     np.testing.assert_allclose([one.square for one in found], [40.5, 50.0])
     np.testing.assert_allclose([one.contrast.plausible for one in found], [45.0**2 / 50.5, 0.5**2 / 0.505])

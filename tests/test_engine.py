@@ -15,7 +15,7 @@ import probcal as pc
 from probcal.errors import InputError
 from probcal.gaussian.choose import ENGINES as CALLED
 from probcal.gaussian.engine import Factors, Group, evidence, noise_score
-from probcal.gaussian.jointly import Variables, covariance_times, embedded
+from probcal.gaussian.jointly import Variables, covariance_times
 from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import find_tracks
 from probcal.inference.fit import calibrate
@@ -73,17 +73,6 @@ def agree(one, other, tolerance=1e-8):
         np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance * max(np.abs(b).max(initial=0.0), 1e-12))
 
 
-def embedded_columns(model, rng):
-    """Columns (N, C, 3) of three further parameters."""
-    return tuple(jnp.asarray(rng.standard_normal((*data.y.shape, 3))) for data in model.rows)
-
-
-def embedded_of(own, factors):
-    """Information and score of three further parameters, by its own matrix where the engine is the naive one."""
-    columns = embedded_columns(own.model, np.random.default_rng(7))
-    return own.embedded(factors, columns) if isinstance(own, Naive) else embedded(own, factors, columns)
-
-
 def responses_of(own, factors, M):
     """The joint covariance times two slopes by states and biases."""
     rng = np.random.default_rng(8)
@@ -109,7 +98,6 @@ MEMBERS = {  # what each is asked with
     "weighed": lambda own, factors, M: (
         own.weighed(some_rows(own.model)).solve(factors, np.ones(M)), own.weighed(some_rows(own.model)).apply(np.eye(M))
     ),
-    "embedded": lambda own, factors, _: embedded_of(own, factors),
     "respond": lambda own, factors, M: responses_of(own, factors, M),
 }  # fmt: skip
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 from worlds import exact, linear, resting, ruler
 
 import probcal
@@ -416,8 +417,8 @@ def test_status_follows_the_gravest():
 def test_verdicts_stand_no_higher_than_the_status(status, ended, word, reason):
     problem, _ = linear("plane")
     M = len(problem.labels)
-    known = verdict.Grounds(np.full(M, 0.9), np.zeros(M), np.zeros(M), 3.0)
-    words, reasons = verdict.judge_biases(problem, Status(status), [ended] * M, known, {}, {}, "", {})
+    known = verdict.Grounds(np.full(M, 0.9), np.zeros(M), 3.0)
+    words, reasons = verdict.judge_biases(problem, Status(status), [ended] * M, known, {})
     assert set(words) == {word}
     assert all(reason in text for text in reasons)
 
@@ -425,9 +426,9 @@ def test_verdicts_stand_no_higher_than_the_status(status, ended, word, reason):
 def test_a_bias_that_shares_an_open_combination_is_weak_and_names_it():
     problem, _ = linear("plane")
     M = len(problem.labels)
-    known = verdict.Grounds(np.full(M, 0.9), np.zeros(M), np.zeros(M), 3.0)
-    shared = {1: "a common gain of all (information 0.01)"}
-    words, reasons = verdict.judge_biases(problem, Status.CONVERGED, ["estimated"] * M, known, {}, {}, "", shared)
+    known = verdict.Grounds(np.full(M, 0.9), np.zeros(M), 3.0)
+    shared = {1: "it belongs to a common gain of all (information 0.01), which the data leave open"}
+    words, reasons = verdict.judge_biases(problem, Status.CONVERGED, ["estimated"] * M, known, {"weak": shared})
     assert words[1] == "weak"
     assert "it belongs to a common gain of all" in reasons[1]
     assert {word for m, word in enumerate(words) if m != 1} == {"determined"}
@@ -438,15 +439,17 @@ def test_a_survey_is_in_conflict_only_where_it_explains_part_of_the_misfit():
     M = len(problem.labels)
     for excess, word, reason in ((100.0, "conflicting", "(limit 3.0)"), (56_000.0, "weak", "by a misfit elsewhere")):
         part = verdict.explained_part(np.full(M, 7.0), np.ones(M), np.ones(M), excess)
-        known = verdict.Grounds(np.full(M, 0.9), np.zeros(M), np.full(M, 7.0), 3.0, part)
-        words, reasons = verdict.judge_biases(problem, Status.CONVERGED, ["estimated"] * M, known, {}, {}, "", {})
+        known = verdict.Grounds(np.full(M, 0.9), np.full(M, 7.0), 3.0, part)
+        words, reasons = verdict.judge_biases(problem, Status.CONVERGED, ["estimated"] * M, known, {})
         assert set(words) == {word}
         assert all("7.0 sd beyond its" in text and reason in text for text in reasons)
 
 
 def test_one_reason_of_many_biases_is_said_once():
     labels, reason = [f"n{k}.gain" for k in range(20)], "the fit ended misfit"
-    said = findings.alarms(labels, ["conflicting"] * 19 + ["weak"], [reason] * 20)
+    columns = {"verdict": ["conflicting"] * 19 + ["weak"], "reason": [reason] * 20}
+    group = xr.Dataset({name: ("bias_label", own) for name, own in columns.items()}, {"bias_label": labels})
+    said = findings.alarms(group)
     assert [one.sentence for one in said] == [f"n0.gain, n1.gain, n2.gain, n3.gain and 15 more: {reason}"]
     assert said_once(labels[:3], [reason, "other", reason]) == [reason, "other", "as n0.gain"]
 

@@ -90,7 +90,7 @@ def test_what_cannot_be_compared_is_not():
     tree = pc.fit(problem, pc.MAP(engine="cholmod"), prior=pc.Gaussian())
     for asked in ("__init__", "own_shift", "_of"):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(segments._ByDifferences, asked, lambda *_: (_ for _ in ()).throw(MemoryError))
+            patch.setattr(segments._Differences, asked, lambda *_: (_ for _ in ()).throw(MemoryError))
             checked = pc.assess(problem, tree)
         assert "halves" not in checked.children
         assert "drifting" not in checked["verdict"]["verdict"].values

@@ -23,7 +23,6 @@ from probcal.files import Outputs
 from probcal.gaussian.cholmod import Cholmod
 from probcal.gaussian.choose import ENGINES as CALLED
 from probcal.gaussian.dense import DenseEngine
-from probcal.gaussian.engine import Factors
 from probcal.gaussian.factor import Entries
 from probcal.gaussian.iterative import Iterative
 from probcal.gaussian.joint import JointPrecision, blocks_of
@@ -421,7 +420,7 @@ def test_what_has_no_sparse_form_is_named(monkeypatch):
 def test_what_needs_the_whole_covariance_says_so():
     tree = fitted(pc.MAP(engine="cholmod"), pc.Gaussian())
     with pytest.raises(InputError, match="needs the covariance of all biases, which a large fit in sparse form"):
-        of_biases(tree, drawn()[1], 0.01)
+        of_biases(tree, drawn()[1])
 
 
 @pytest.mark.ci
@@ -629,7 +628,7 @@ def test_what_a_screen_advises_removes_what_all_sensors_share():
     problem = pc.Problem(network, MOTION["car"], table)
     with jax.enable_x64(True):
         at = DenseEngine().at(problem.model, automatic_start(problem))
-        found = shared_directions(problem, at, Factors.alone(np.ones(problem.model.biases)))
+        found = shared_directions(problem, at)
     assert [own.kind for own in found][:3] == ["gauge"] * 3  # two translations and a rotation
     advised = [own.fix for own in found]
     assert all(advised)

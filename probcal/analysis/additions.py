@@ -160,11 +160,9 @@ def _seen(told: Informed, instants: np.ndarray, path: np.ndarray) -> list[np.nda
 
 def _farthest(nodes: Sequence[Node], instants: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Distance (E,) at instants (E,) between places (E, d) and the node that is farthest from them."""
-    away = np.zeros(len(instants))
-    for node in nodes:
-        stands = pose_vector(node, (), np.clip(instants, *_times(node)))
-        away = np.maximum(away, np.linalg.norm(places - stands, axis=1))
-    return away
+    stands = [pose_vector(node, (), np.clip(instants, *_times(node))) for node in nodes]
+    found: np.ndarray = np.max([np.zeros(len(instants)), *(np.linalg.norm(places - own, axis=1) for own in stands)], 0)
+    return found
 
 
 def _times(node: Node) -> tuple[float, float]:
@@ -174,9 +172,8 @@ def _times(node: Node) -> tuple[float, float]:
 
 def _there(nodes: Sequence[Node], instants: np.ndarray) -> np.ndarray:
     """At which instants (E,) it is known where all nodes are."""
-    ends = [_times(node) for node in nodes]
-    first, last = max((a for a, _ in ends), default=-np.inf), min((b for _, b in ends), default=np.inf)
-    return (instants >= first) & (instants <= last)
+    there = ((instants >= first) & (instants <= last) for first, last in map(_times, nodes))
+    return np.all([np.ones(len(instants), bool), *there], 0)
 
 
 def _rows_of_pass(

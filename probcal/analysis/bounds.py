@@ -17,14 +17,14 @@ from probcal import linalg
 from probcal.analysis.standpoint import draw_states, on_tracks_of, true_biases, true_point
 from probcal.errors import InputError, nearest
 from probcal.gaussian.choose import choose
-from probcal.gaussian.engine import Expansion, Factors
+from probcal.gaussian.engine import Expansion, Factors, told_alone
 from probcal.gaussian.mode import Point
 from probcal.labels import NOBODY, listed
 from probcal.linalg import spectrum
 from probcal.model.model import At, Model
 from probcal.model.rows import Linearised
 from probcal.problem import Problem
-from probcal.results.groups import bias_coords, by_target, node_of
+from probcal.results.groups import along, bias_coords, by_target, node_of
 from probcal.simulate import Key, Truth, as_key
 from probcal.types import float64
 
@@ -76,7 +76,7 @@ def bounds(
         z = jax.random.normal(keys[1], z.shape) if kind == "posterior" else z
     prior = np.ones(model.biases) if kind == "posterior" else problem.surveyed.astype(float)
     at = _averaged(model, levels, z, states)
-    alone = _with_all_else_known(at) + prior
+    alone = told_alone(at) + prior
     information = at.information()
     if information is None:
         variance, bounded, spread = _by_ridge(at, prior, alone)
@@ -124,14 +124,6 @@ def _rooted(information: jax.Array, used: int) -> Linearised:
     return Linearised(jnp.zeros_like(size), jnp.ones_like(size), root[:, :, :used], root[:, :, used:])
 
 
-def _with_all_else_known(at: Expansion) -> np.ndarray:
-    """Information (M,) about each bias with all other biases and the tracks known."""
-    found = np.zeros(at.model.biases + 1)
-    for *_, lin, read in at.model.each_block(at.rows, at.model.read):
-        np.add.at(found, read, np.einsum("ncp,nc,ncp->np", lin.bias, lin.weight, lin.bias))
-    return found[:-1]
-
-
 def _by_ridge(
     at: Expansion, prior: np.ndarray, alone: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
@@ -175,7 +167,7 @@ def _tree(
     """The tree of standard deviations (M,) and a covariance (M, M) of z, and variances (E, n) of the states."""
     labels, sd = np.array(problem.labels, str), (sd * problem.scales)[bounded]
     own = {"sd": sd, "scale": problem.scales[bounded]}
-    bias = xr.Dataset({k: ("bias_label", value) for k, value in own.items()}, coords=bias_coords(problem, bounded))
+    bias = xr.Dataset(along("bias_label", own), coords=bias_coords(problem, bounded))
     if covariance is not None:
         covariance = (covariance * np.outer(problem.scales, problem.scales))[np.ix_(bounded, bounded)]
         bias = bias.assign_coords(bias_label_other=labels[bounded])

@@ -6,7 +6,7 @@ Each fit keeps what its data say of the biases, trajectories marginalised: a qua
 all others stay common; it needs no prior of the change. Exact on a linear problem.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ from probcal.errors import InputError, checked
 from probcal.labels import check_name, label_parts, listed, step_of
 from probcal.linalg import marginalise
 from probcal.results.answer import HALF
+from probcal.results.groups import along
 from probcal.results.modes import rivals
 from probcal.results.read import listed_in, stated_values
 from probcal.results.schema import INTERVAL, held_biases, matrix_of
@@ -36,7 +37,15 @@ class Likelihood(NamedTuple):
     labels: list[str]
     information: np.ndarray  # (M, M)
     pull: np.ndarray  # (M,)
-    inflation: np.ndarray  # (M,) of variances
+    inflation: np.ndarray  # (M,) of variances, 1 where nobody looked
+
+    @classmethod
+    def of(cls, tree: xr.DataTree) -> "Likelihood":
+        """That of a fit."""
+        group = tree["calibration"].to_dataset()
+        labels = [str(label) for label in group["bias_label"].values]
+        wide = tree["verdict"].to_dataset()["inflation"].values if "verdict" in tree.children else np.ones(len(labels))
+        return cls(labels, group["information"].values, group["pull"].values, np.maximum(wide, 1.0))
 
     def about(self, labels: list[str]) -> "Likelihood":
         """The same about these biases alone, the others integrated under their declared scales."""
@@ -77,24 +86,22 @@ def changes(first: xr.DataTree, second: xr.DataTree, *, names: Sequence[str] = (
     for name, tree in pair.items():
         _check(name, tree)
     _check_zero(pair)
-    labels = [label for label in common_labels(pair, "changes") if _still(first, label)]  # the first piece stays
+    every = set(
+        first["calibration"].to_dataset()["bias_label"].values.tolist()
+    )  # of a drifting bias the first piece stays
+    labels = [label for label in common_labels(pair, "changes") if step_of(label, every) is None]
     if _same_data(first, second):
         raise InputError("changes: both fits are of the same data; compare() puts methods side by side")
-    said = [_likelihood(tree).about(labels) for tree in pair.values()]
+    said = [Likelihood.of(tree).about(labels) for tree in pair.values()]
     group = first["calibration"].to_dataset().sel(bias_label=labels)
     change = _changes(said, group["scale"].values)
     means = [tree["calibration"].to_dataset().sel(bias_label=labels)["mean"].values for tree in pair.values()]
     columns = {**change, "first": means[0], "second": means[1]}
     coords = {"bias_label": labels} | {name: ("bias_label", group[name].values) for name in ("unit", "scale")}
-    found = xr.Dataset({name: ("bias_label", values) for name, values in columns.items()}, coords)
+    found = xr.Dataset(along("bias_label", columns), coords)
     found.attrs |= {"limit": float(np.sqrt(limit_of(len(labels)))), "rate": RATE}
     told = _findings(found, pair)
-    tree = xr.DataTree.from_dict(
-        {
-            "change": found,
-            "finding": finding_group(told),
-        }
-    )
+    tree = xr.DataTree.from_dict({"change": found, "finding": finding_group(told)})
     tree.attrs |= {"first": str(names[0]), "second": str(names[1]), "interval_probability": INTERVAL}
     return tree
 
@@ -110,8 +117,7 @@ def _check(name: str, tree: xr.DataTree) -> None:
     if "pull" not in group:
         raise InputError(f'changes: "{name}" does not keep what its data say of the biases; fit it again')
     matrix_of(group, "information", "changes")
-    wide = _inflation(tree)
-    if not all(np.isfinite(values).all() for values in (group["pull"], group["information"], wide)):
+    if not all(np.isfinite(values).all() for values in Likelihood.of(tree)[1:]):
         raise InputError(f'changes: what the data of "{name}" say of the biases is not finite; fit it again')
 
 
@@ -126,7 +132,7 @@ def _check_zero(pair: dict[str, xr.DataTree]) -> None:
         if not np.isclose(a, b, rtol=1e-9, atol=1e-12):
             values = f'{a:.10g} in "{one}" and {b:.10g} in "{two}"'
             raise InputError(f"changes: {what} is stated as {values}; state the same values in both")
-    held = [held_biases(tree) for tree in (first, second)]
+    held = [held_biases(first), held_biases(second)]
     free = [set(tree["calibration"].to_dataset()["bias_label"].values.tolist()) for tree in pair.values()]
     for k, name in enumerate(pair):
         for label, value in held[k].items():
@@ -141,26 +147,9 @@ def _stated(tree: xr.DataTree) -> dict[str, float]:
     return {label: value for label, value in values.items() if not moving[label_parts(label)[0]]}
 
 
-def _still(tree: xr.DataTree, label: str) -> bool:
-    """Whether a bias is no step of a drifting one."""
-    return step_of(label, set(tree["calibration"].to_dataset()["bias_label"].values.tolist())) is None
-
-
 def _same_data(first: xr.DataTree, second: xr.DataTree) -> bool:
     one, two = (tree["observed_data"].to_dataset() for tree in (first, second))
     return all(np.array_equal(one[name].values, two[name].values) for name in ("y", "time", "sensor"))
-
-
-def _likelihood(tree: xr.DataTree) -> Likelihood:
-    group = tree["calibration"].to_dataset()
-    labels = [str(label) for label in group["bias_label"].values]
-    return Likelihood(labels, group["information"].values, group["pull"].values, np.maximum(_inflation(tree), 1.0))
-
-
-def _inflation(tree: xr.DataTree) -> np.ndarray:
-    """How much wider (M,) the variances are than the model says, 1 where nobody looked."""
-    count = tree["calibration"].sizes["bias_label"]
-    return tree["verdict"].to_dataset()["inflation"].values if "verdict" in tree.children else np.ones(count)
 
 
 def _changes(said: Sequence[Likelihood], scale: np.ndarray) -> dict[str, np.ndarray]:
@@ -171,11 +160,9 @@ def _changes(said: Sequence[Likelihood], scale: np.ndarray) -> dict[str, np.ndar
         information[k * M : (k + 1) * M, k * M : (k + 1) * M] = own.information
     both = pieces.Pieces(information, np.concatenate([own.pull for own in said]), np.eye(M), np.zeros(M))
     inflation = np.maximum(*(own.inflation for own in said))
-    moved = pieces.changing(
-        both, {"second": PATTERN}, {"second": inflation}, lambda freedom: limit_of(M, freedom), most=M
-    )
+    moved = pieces.changing(both, {"second": PATTERN}, {"second": inflation}, M, most=M)
     free = _beside_each_other(both, [one.bias for one in moved], inflation)
-    beside = pieces.contrasts(both, PATTERN, [(k, PATTERN) for k in free]) | free
+    beside = _but(both, free) | free
     value, sd = np.zeros(M), np.full(M, np.inf)  # of what neither recording sees
     for m, contrast in beside.items():
         value[m], sd[m] = contrast.estimate[0], np.sqrt(inflation[m] / contrast.information[0, 0])
@@ -193,7 +180,7 @@ def _beside_each_other(both: pieces.Pieces, moved: list[int], inflation: np.ndar
     """How each bias that moved changed beside the others; what these explain away is common again, the least first."""
     limit = limit_of(len(inflation))
     while moved:
-        found = {m: pieces.contrasts(both, PATTERN, [(k, PATTERN) for k in moved if k != m]).get(m) for m in moved}
+        found = {m: _but(both, moved, m).get(m) for m in moved}
         square = {m: one.square / inflation[m] if one is not None else 0.0 for m, one in found.items()}
         least = min(moved, key=square.__getitem__)
         if square[least] > limit:
@@ -202,13 +189,17 @@ def _beside_each_other(both: pieces.Pieces, moved: list[int], inflation: np.ndar
     return {}
 
 
+def _but(both: pieces.Pieces, free: Iterable[int], kept: int = -1) -> dict[int, pieces.Contrast]:
+    """How each bias changed where those that are free changed too, but for one."""
+    return pieces.contrasts(both, PATTERN, [(k, PATTERN) for k in free if k != kept])
+
+
 def _alike(both: pieces.Pieces, moved: int, free: dict[int, pieces.Contrast], inflation: np.ndarray) -> list[int]:
     """Other biases whose change in the place of one that moved would explain the data about as well."""
     if moved not in free:
         return []
-    found = pieces.contrasts(both, PATTERN, [(k, PATTERN) for k in free if k != moved])
     least = free[moved].square / inflation[moved] - ALIKE
-    return [k for k, one in found.items() if k not in free and one.square / inflation[k] > least]
+    return [k for k, one in _but(both, free, moved).items() if k not in free and one.square / inflation[k] > least]
 
 
 def _contradictions(tree: xr.DataTree) -> str:

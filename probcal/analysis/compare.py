@@ -14,6 +14,7 @@ from probcal.analysis.findings import Finding, finding_group
 from probcal.analysis.overlap import Marginal, of_draws, of_gaussian, overlap, wasserstein
 from probcal.errors import InputError, checked, nearest
 from probcal.labels import label_parts
+from probcal.results.groups import along
 from probcal.results.read import known_truth
 from probcal.results.schema import EVIDENCES
 from probcal.results.scores import judged_by, rms
@@ -215,7 +216,7 @@ def _method(tree: xr.DataTree, labels: list[str]) -> xr.Dataset:
     attrs |= {n: float(tree.attrs[n]) for n in TOTALS if n in tree.attrs and np.isfinite(tree.attrs[n])}
     if "sample_stats" in tree.children and "diverging" in tree["sample_stats"].data_vars:
         attrs["divergences"] = int(tree["sample_stats"]["diverging"].sum())
-    return xr.Dataset({name: ("bias_label", v) for name, v in columns.items()}, {"bias_label": labels}, attrs)
+    return xr.Dataset(along("bias_label", columns), {"bias_label": labels}, attrs)
 
 
 def _cost(method: xr.Dataset) -> dict[str, float]:

@@ -68,32 +68,29 @@ def _against(comparison: xr.DataTree, name: str, reference: str) -> list[Finding
         text += f"; of those pruned {level:.0%} of the other posterior lies within {ZERO:g} scales of zero"
     found.append(Finding("enough", name, text))
 
-    def tell(kind: str, chosen: Any, size: Any, text: str, form: str) -> None:
-        """Add a sentence on the chosen biases, {} their number, those of largest size named, each with its numbers."""
+    times, left = f"times that of {reference}", "are not zero to"
+    frame["gamma_upper"] = other["gamma_upper"].to_series() if "gamma_upper" in other else frame["gamma"]
+    above = frame["gamma"] - frame["gamma_upper"]
+    near = "{overlap:.0%} near zero, sd "
+    missing = f"the {level:.0%} intervals of {{}} of {total} miss the mean of {reference}"
+    sds, many = f"the sd of {{}} of {total} is", f"{{}} of the {frame['pruned'].sum()} that it pruned"
+    more = f"{{}} of the {frame['pruned_there'].sum()} that {reference} pruned {left} it, which leaves them"
+    gammas = f"gamma of {{}} of {total} lies above the {level:.0%} interval of that of {reference}"
+    cases = (  # kind, biases, size, text with {} their number, numbers of each
+        ("interval", missed, frame["away"], missing, "{mean:.3g} against {mean_there:.3g}{unit}"),
+        ("narrow", narrow, -frame["ratio"], f"{sds} below {NARROW:g} {times}", "{ratio:.2g} times"),
+        ("wide", wide, frame["ratio"], f"{sds} above {1 / NARROW:.2f} {times}", "{ratio:.2g} times"),
+        ("pruned", lost & frame["pruned"], -frame["overlap"], f"{many} {left} {reference}, which leaves them",
+         near + "{wide_there:.2g} scales"),
+        ("pruned", lost & ~frame["pruned"], -frame["overlap"], more, near + "{wide:.2g} scales"),
+        ("gamma", above > GAMMA, above, gammas, "{gamma:.2f} above {gamma_upper:.2f}"),
+    )  # fmt: skip
+    for kind, chosen, size, text, form in cases:
         own = frame[chosen].loc[size[chosen].sort_values(ascending=False, kind="stable").index]
         if len(own):
             named = [f"{label} ({form.format_map(row)})" for label, row in own.to_dict("index").items()]
             text = text.replace("{}", str(len(own)), 1)
             found.append(Finding(kind, own.index[0], f"{name}: {text}: {listed(named, NAMES)}"))
-
-    text = f"the {level:.0%} intervals of {{}} of {total} miss the mean of {reference}"
-    tell("interval", missed, frame["away"], text, "{mean:.3g} against {mean_there:.3g}{unit}")
-    times = f"times that of {reference}"
-    text = f"the sd of {{}} of {total} is below {NARROW:g} {times}"
-    tell("narrow", narrow, -frame["ratio"], text, "{ratio:.2g} times")
-    text = f"the sd of {{}} of {total} is above {1 / NARROW:.2f} {times}"
-    tell("wide", wide, frame["ratio"], text, "{ratio:.2g} times")
-    text = f"{{}} of the {frame['pruned'].sum()} that it pruned are not zero to {reference}, which leaves them"
-    form = "{overlap:.0%} near zero, sd {wide_there:.2g} scales"
-    tell("pruned", lost & frame["pruned"], -frame["overlap"], text, form)
-    text = f"{{}} of the {frame['pruned_there'].sum()} that {reference} pruned are not zero to it, which leaves them"
-    form = "{overlap:.0%} near zero, sd {wide:.2g} scales"
-    tell("pruned", lost & ~frame["pruned"], -frame["overlap"], text, form)
-    if "gamma_upper" in other:
-        frame["gamma_upper"] = other["gamma_upper"].to_series()
-        above = frame["gamma"] - frame["gamma_upper"]
-        text = f"gamma of {{}} of {total} lies above the {level:.0%} interval of that of {reference}"
-        tell("gamma", above > GAMMA, above, text, "{gamma:.2f} above {gamma_upper:.2f}")
     return found
 
 

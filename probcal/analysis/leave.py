@@ -7,13 +7,12 @@ predictive density of what was left out is the difference of two Laplace evidenc
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 import xarray as xr
 from scipy import special
 
@@ -38,15 +37,8 @@ PINNED = 1e12  # precision by which a bias is held at zero
 TARGETS = 32  # beyond which targets are not left out one by one
 
 
-class Refit(NamedTuple):
-    """Where one refit ends."""
-
-    evidence: jax.Array  # log p(data), but for the determinant of the prior
-    square: jax.Array  # least squares of all innovations, noises and biases in the linearised problem
-
-
-def _stepped(at: Expansion, factors: Factors, held: np.ndarray, prior: Precision) -> Refit:
-    """One Fisher-scoring step from a point to the mode, and Laplace's evidence there; biases in `held` (M,) go to 0.
+def _stepped(at: Expansion, factors: Factors, held: np.ndarray, prior: Precision) -> tuple[float, float]:
+    """Evidence, by Laplace's formula, and least squares one Fisher-scoring step from a point, biases `held` (M,) at 0.
 
     The step counts only where it raises the density: at a mode it changes nothing, on a linear problem it is exact.
     """
@@ -55,8 +47,8 @@ def _stepped(at: Expansion, factors: Factors, held: np.ndarray, prior: Precision
     start = at.point._replace(z=jnp.asarray(np.where(held, 0.0, z)))
     moved = at.moved(at.solve(pinned, np.asarray(at.slope()) + pinned.pull(z)))
     least, square = _ends(at.model, at.point, start, moved, prior, at.rows)
-    volume = at.log_det(pinned).value - np.count_nonzero(held) * np.log(PINNED) + at.eliminated.logdet
-    return Refit(-least - 0.5 * volume, square)
+    volume = at.log_det(pinned).value - np.count_nonzero(held) * np.log(PINNED) + float(at.eliminated.logdet)
+    return 0.5 * (_logdet(prior, held) - volume) - float(least), float(square)
 
 
 @jax.jit
@@ -97,8 +89,7 @@ class _Refits:
             at = fit.engine.at(frozen, find_mode(frozen, start, prior, STEPS, TOLERANCE).point)
         elif weights is not None:
             at = at.weighed(tuple(jnp.asarray(own) for own in weights))
-        found = _stepped(at, Factors.of(prior), held, prior)
-        return float(found.evidence) + 0.5 * _logdet(prior, held), float(found.square)
+        return _stepped(at, Factors.of(prior), held, prior)
 
 
 def _logdet(prior: Precision, held: np.ndarray) -> float:
@@ -114,76 +105,61 @@ def _logdet(prior: Precision, held: np.ndarray) -> float:
 
 
 class Left(NamedTuple):
-    """What the rest says of groups of data (sensors or targets) that were left out, each (groups,)."""
+    """What the rest says of sensors or targets that were left out, each (groups,).
 
-    names: list[str]
-    elpd: np.ndarray  # log predictive density given the rest
-    nis: np.ndarray  # normalised square of its innovation predicted by the rest, a datum
-    stated: np.ndarray  # elpd with the group's own biases held at 0
-    stated_nis: np.ndarray
+    `elpd` is the log predictive density given the rest, `rest_nis` the mean square of its innovations predicted by the
+    rest. Of sensors also the same with their own biases held at 0, and the `difference` of both densities: how much
+    better a sensor fits the rest calibrated than as stated.
+    """
+
+    values: dict[str, np.ndarray]
     quick: bool  # one step from the fit instead of a search
 
 
-def leave_sensors(fit: Judged, chosen: Collection[str]) -> Left | None:
-    """Chosen sensors left out, None for a single one; the biases that only it reads have their declared scales.
+def leave_out(fit: Judged, name: str, chosen: Sequence[str]) -> Left | None:
+    """Chosen ones of each "sensor" or "target" left out; the biases that only one sensor reads have their declared
+    scales then.
 
-    `elpd` less `stated` says how much better the sensor fits the rest calibrated than as stated.
+    None for a single one, and for more than 32 targets.
     """
-    problem, readers = fit.problem, fit.readers
-    alpha, none = np.asarray(fit.prior.alpha), np.zeros(problem.model.biases, bool)
-    sensor = problem.measurements.sensor
-    counted = set(fit.data["sensor"])  # some have rows of weight 0 only
-    present = [s for s in np.unique(sensor) if problem.network.sensors[s].name in counted]
-    if len(present) < 2:
+    problem, readers, sensors, rows = fit.problem, fit.readers, name == "sensor", list[Any]()
+    if fit.data[name].nunique() < 2 or (len(chosen) > TARGETS and not sensors):
         return None
-    present = [s for s in present if problem.network.sensors[s].name in chosen]
-    refits, rows = _Refits(fit, 3 * len(present)), []
-    for s in present:
-        own = readers[s] & (readers.sum(0) == 1)
+    data, alpha, none = problem.measurements, np.asarray(fit.prior.alpha), np.zeros(problem.model.biases, bool)
+    owner, names = data.target, list(data.target_names)
+    if sensors:
+        owner, names = data.sensor, [placed.name for placed in problem.network.sensors]
+    refits = _Refits(fit, (3 if sensors else 1) * len(chosen))
+    whole = [] if sensors else [refits.run(None, alpha, none)]
+    for k in map(names.index, chosen):
+        own = readers[k] & (readers.sum(0) == 1) if sensors else none
         wide = np.where(own & ~problem.surveyed, 1.0, alpha)
-        rest = refits.run(sensor == s, wide, none)
-        rows.append([rest, refits.run(None, wide, none), refits.run(None, wide, own)])
-    return _left([problem.network.sensors[s].name for s in present], rows, fit.data["sensor"], refits.quick)
-
-
-def leave_targets(fit: Judged, chosen: Collection[str]) -> Left | None:
-    """Chosen targets left out; None where there is one only, or more than 32 are chosen."""
-    problem, target = fit.problem, fit.problem.measurements.target
-    counted = set(fit.data["target"])
-    present = [t for t in np.unique(target) if problem.measurements.target_names[t] in counted]
-    if len(present) < 2 or len(chosen) > TARGETS:
-        return None
-    present = [t for t in present if problem.measurements.target_names[t] in chosen]
-    alpha, none = np.asarray(fit.prior.alpha), np.zeros(problem.model.biases, bool)
-    refits = _Refits(fit, len(present))
-    whole = refits.run(None, alpha, none)
-    rows = [[refits.run(target == t, alpha, none), whole, whole] for t in present]
-    names = [problem.measurements.target_names[t] for t in present]
-    return _left(names, rows, fit.data["target"], refits.quick)
-
-
-def _left(names: list[str], rows: list[Any], owner: pd.Series, quick: bool) -> Left:
-    values = np.array(rows)  # (groups, 3, 2)
-    count = owner.value_counts()[names].to_numpy()
-    elpd, square = values[:, 1:, 0] - values[:, :1, 0], (values[:, 1:, 1] - values[:, :1, 1]) / count[:, None]
-    return Left(names, elpd[:, 0], square[:, 0], elpd[:, 1], square[:, 1], quick)
+        rows.append([refits.run(owner == k, wide, none), *(whole or [refits.run(None, wide, h) for h in (none, own)])])
+    found, count = np.array(rows), fit.data[name].value_counts()[list(chosen)].to_numpy()  # found (groups, 2 or 3, 2)
+    elpd, nis = np.moveaxis(found[:, 1:] - found[:, :1], 2, 0) / np.stack([np.ones(len(count)), count])[:, :, None]
+    values = {"elpd": elpd[:, 0], "rest_nis": nis[:, 0]}
+    if sensors:
+        values |= {"elpd_stated": elpd[:, 1], "difference": elpd[:, 0] - elpd[:, 1], "stated_nis": nis[:, 1]}
+    return Left(values, refits.quick)
 
 
 class Pointwise(NamedTuple):
-    """PSIS-LOO of groups of data, each (groups,): log predictive density and Pareto k."""
+    """PSIS-LOO of groups of data, each (groups,): log predictive density, Pareto k, and the density with them."""
 
     elpd: np.ndarray
     pareto_k: np.ndarray
+    within: np.ndarray
 
 
-def psis(tree: xr.DataTree, group: np.ndarray, count: int) -> Pointwise:
+def psis(tree: xr.DataTree, group: np.ndarray, count: int, efficiency: float = 1.0) -> Pointwise:
     """PSIS-LOO of the log-likelihood in a tree, summed over groups (data,); `az.loo` where each is a datum."""
     values = tree["log_likelihood"].to_dataset()["y"].values
     values = values.reshape(-1, values.shape[2])
     order = np.argsort(group, kind="stable")
     summed = np.add.reduceat(values[:, order], np.searchsorted(group[order], np.arange(count)), axis=1).T
-    weights, pareto_k = smoothed(-summed)
-    return Pointwise(special.logsumexp(weights + summed, axis=1), pareto_k)
+    weights, pareto_k = smoothed(-summed, efficiency)
+    elpd, within = special.logsumexp([weights + summed, summed], axis=2)
+    return Pointwise(elpd, pareto_k, within - np.log(len(values)))
 
 
 def tailed(tree: xr.DataTree) -> bool:

@@ -17,6 +17,7 @@ import jax
 import numpy as np
 import xarray as xr
 
+from probcal.analysis.check import Case, Checked, check
 from probcal.analysis.findings import Finding
 from probcal.analysis.verdict import limit_of
 from probcal.gaussian.engine import Engine, Expansion, Factors, noise_information, noise_score
@@ -161,29 +162,21 @@ def _at(engine: Engine, at: Expansion, members: Members, step: np.ndarray, z: np
     return engine.settled(replace(model, rows=rows, recursions=recursions), moved)
 
 
-class _Expansion(NamedTuple):
-    """The log evidence about a point: slope and negative curvature by log levels, biases following."""
-
-    slope: np.ndarray  # (K,)
-    covariance: np.ndarray  # (K, K) the inverse of that curvature
-    pull: np.ndarray  # (K, M) of the score of z by each log level
-    follow: np.ndarray  # (K, M) of the mode of z
-
-
 def _expanded(
-    fit: Judged, engine: Engine, factors: Factors, at: Expansion, members: Members, moved: np.ndarray
-) -> tuple[_Expansion | None, Expansion]:
-    """The expansion where the levels have moved already, (K,), at the mode of z near a point; None without a maximum.
+    fit: Judged, factors: Factors, at: Expansion, members: Members, moved: np.ndarray
+) -> tuple[Expansion, tuple[np.ndarray, ...] | None]:
+    """The log evidence where the levels have moved already, (K,), at the mode of z near a point, biases following.
 
-    Also the posterior at the mode.
+    The posterior there; slope (K,) and inverse negative curvature (K, K) by log levels, how much these pull the score
+    of z (K, M) and move its mode (K, M), None without a maximum.
     """
-    K, none = len(members.levels), np.zeros(len(members.levels))
+    K, engine = len(members.levels), fit.engine
     here = slopes(at, factors, members)
     for _ in range(CLIMBS):
         away = np.asarray(at.solve(factors, here.z + factors.pull(at.point.z)))
         if not np.abs(away).max(initial=0.0) > SETTLED_Z:
             break
-        at = _at(engine, at, members, none, away)
+        at = _at(engine, at, members, np.zeros(K), away)
         here = slopes(at, factors, members)
     still, beside = np.zeros(len(at.point.z)), list[tuple[Slopes, Slopes]]()
     for unit in np.eye(K):
@@ -202,11 +195,11 @@ def _expanded(
     slope[own] -= np.asarray(fit.point.levels)[unknown[own]] / spread**2
     alone = np.diag(curved) + known
     if not (np.isfinite(matrix).all() and np.isfinite(slope).all() and (alone > 0).all()):
-        return None, at
+        return at, None
     matrix = matrix + np.diag(known)
     if not eigenvalues(matrix).min() > 0:  # far from the maximum: each level by itself
         matrix = np.diag(alone)
-    return _Expansion(slope, invert(matrix), pull, follow), at
+    return at, (slope, invert(matrix), pull, follow)
 
 
 def ask(fit: Judged, members: Members, factors: Factors) -> Wanted | None:
@@ -235,21 +228,22 @@ def _followed(fit: Judged, members: Members, factors: Factors) -> Wanted | None:
 
     The slope of N noises of mean square r^2 is N (r^2 exp(-2 t) - 1): a Newton step d stands for t = -log(1 - 2 d) / 2.
     """
-    engine, at, K = fit.engine, fit.expansion, len(members.levels)
+    at, K = fit.expansion, len(members.levels)
     step, shift, square = np.zeros(K), np.zeros((K, len(at.point.z))), np.zeros(K)
     sd, every = np.zeros(K), np.ones(K, bool)
     for turn in range(TURNS):
-        found, at = _expanded(fit, engine, factors, at, members, step)
+        at, found = _expanded(fit, factors, at, members, step)
         if found is None:
             return None if turn == 0 else Wanted(step, sd, square, shift, every)
-        newton, sd = found.covariance @ found.slope, np.sqrt(np.diag(found.covariance))
+        slope, covariance, pull, follow = found
+        newton, sd = covariance @ slope, np.sqrt(np.diag(covariance))
         square = newton**2 / sd**2 if turn == 0 else square
         bent = -0.5 * np.log(np.maximum(1.0 - 2.0 * newton, np.exp(-2.0 * LONGEST)))
         own = np.clip(bent, -LONGEST, LONGEST)
-        step, shift = step + own, shift + own[:, None] * fit.times(found.pull.T).T
+        step, shift = step + own, shift + own[:, None] * fit.times(pull.T).T
         if np.abs(own).max() < NEAR or not (newton**2 > NEGLIGIBLE * sd**2).any():
             break
-        at = _at(engine, at, members, own, own @ found.follow)
+        at = _at(fit.engine, at, members, own, own @ follow)
     return Wanted(step, sd, square, shift, every)
 
 
@@ -262,7 +256,8 @@ def _screened(at: Expansion, factors: Factors, members: Members) -> Wanted:
     return Wanted(step, sd, (step / sd) ** 2, shift, suspect)
 
 
-def check_levels(fit: Judged, tree: xr.DataTree) -> tuple[xr.Dataset | None, list[Finding], dict[int, str]]:
+@check("answer", "factor")
+def check_levels(case: Case) -> Checked:
     """Group `level_check`, findings on declared levels, and why the answer of some biases is in doubt with them.
 
     `factor` is what the data ask for over what the fit had (all levels together), `factor_sd` its sd, `square` the
@@ -271,15 +266,15 @@ def check_levels(fit: Judged, tree: xr.DataTree) -> tuple[xr.Dataset | None, lis
     `factor_sd` are upper bounds. Of process noise nothing is said where it was left out of the fit. Where precisions
     were integrated the declared scales are held.
     """
-    members = members_of(fit.problem, moving=tree.attrs.get("motion") != "left out")
-    integrated = tree.attrs["precisions"] == "integrated"
+    fit, attrs, asked = case.fit, case.tree.attrs, None
+    members = members_of(fit.problem, moving=attrs.get("motion") != "left out")
+    integrated = attrs["precisions"] == "integrated"
     factors = Factors.alone(np.ones(len(fit.point.z))) if integrated else fit.factors
-    asked = None
     if members.levels and fit.problem.model.biases:
-        with suppress(np.linalg.LinAlgError):  # a flat prior on biases that the data leave open
+        with suppress(MemoryError, np.linalg.LinAlgError):  # a flat prior on biases that the data leave open
             asked = ask(fit, members, factors)
     if asked is None:
-        return None, [], {}
+        return Checked()
     problem, limit = fit.problem, limit_of(sum(level.unknown < 0 for level in members.levels))
     sd = np.maximum(fit.sd, 1e-150)
     factor = np.exp(np.clip(asked.step, -FARTHEST, FARTHEST))
@@ -297,7 +292,7 @@ def check_levels(fit: Judged, tree: xr.DataTree) -> tuple[xr.Dataset | None, lis
         values["shift"] = (("level", "bias_label"), asked.shift * problem.scales)
     group = xr.Dataset(values, bias_coords(problem) | {"level": _names(members.levels)})
     group.attrs |= {"limit": float(limit)}
-    return group, findings, _doubts(members, moved, factor)
+    return Checked({"level_check": group}, findings, {"weak": _doubts(members, moved, factor)})
 
 
 def _names(levels: list[Level]) -> list[str]:

@@ -5,14 +5,13 @@ Vehtari, Gelman and Gabry 2017; they are what `arviz.loo` and `arviz.compare` gi
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
-from probcal.analysis.leave import tailed
+from probcal.analysis.leave import good_k, psis, standard_error, tailed
 from probcal.errors import InputError
 from probcal.lazy import Later
 
@@ -51,18 +50,16 @@ def elpd(fits: Mapping[str, xr.DataTree], orders: Mapping[str, np.ndarray]) -> d
     for name, tree in fits.items():
         if not tailed(tree):
             continue
-        y = tree["log_likelihood"]["y"].isel(datum=orders[name]).reset_coords(drop=True).to_dataset()
-        bias = tree["posterior"].to_dataset()["bias"]
-        pair = xr.DataTree.from_dict({"posterior": bias.to_dataset(), "log_likelihood": y})
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a large Pareto k is reported, not warned about
-            loo = arviz_stats.loo(pair, pointwise=True, reff=_efficiency(bias))
-        if not np.isfinite(loo.elpd_i).all():
+        data = len(orders[name])
+        own = psis(tree, np.arange(data), data, _efficiency(tree["posterior"].to_dataset()["bias"]))
+        if not np.isfinite(own.elpd).all():
             continue
-        pointwise[name] = loo.elpd_i.values
-        bad = float(np.mean(~(loo.pareto_k.values <= loo.good_k)))
-        found[name] = {"elpd": float(loo.elpd), "elpd_se": float(loo.se), "p_loo": float(loo.p), "bad_k": bad}
-        found[name]["good_k"] = float(loo.good_k)
+        pointwise[name], good = own.elpd[orders[name]], good_k(tree)
+        found[name] = {
+            "elpd": float(own.elpd.sum()), "elpd_se": standard_error(own.elpd),
+            "p_loo": float((own.within - own.elpd).sum()), "bad_k": float(np.mean(~(own.pareto_k <= good))),
+            "good_k": good,
+        }  # fmt: skip
     if len(found) > 1:
         best = max(found, key=lambda name: (found[name]["bad_k"] <= BAD, found[name]["elpd"]))
         for name, values in found.items():

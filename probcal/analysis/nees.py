@@ -8,6 +8,7 @@ import xarray as xr
 from scipy import special
 
 from probcal import linalg
+from probcal.analysis.verdict import RATE
 from probcal.inference.fitted import Judged
 from probcal.labels import coordinates
 from probcal.linalg import eigenvalues, spectrum
@@ -27,7 +28,7 @@ class Nees(NamedTuple):
     upper: float
 
 
-def of_positions(target: str, track: xr.Dataset, states: np.ndarray, truth: Truth, rate: float) -> Nees | None:
+def of_positions(target: str, track: xr.Dataset, states: np.ndarray, truth: Truth) -> Nees | None:
     """NEES of the positions of one target, a dimension, from draws of its states (D, E, n); None without a truth.
 
     Errors of neighbouring epochs are alike: the limits of the mean are those of the posterior's own draws.
@@ -52,11 +53,11 @@ def of_positions(target: str, track: xr.Dataset, states: np.ndarray, truth: Trut
     error = track["mean"].sel(component=axes).values[known] - true[known]
     value = (np.einsum("eij,ej->ei", whiten, error) ** 2).mean(1)
     own = (np.einsum("eij,sej->sei", whiten, deviation) ** 2).mean((1, 2))
-    lower, upper = np.quantile(own, [rate / 2, 1 - rate / 2])
+    lower, upper = np.quantile(own, [RATE / 2, 1 - RATE / 2])
     return Nees(value, known, float(value.mean()), float(lower), float(upper))
 
 
-def of_biases(tree: xr.DataTree, truth: Truth, rate: float) -> tuple[float, int, float, float] | None:
+def of_biases(tree: xr.DataTree, truth: Truth) -> tuple[float, int, float, float] | None:
     """NEES of all biases that the truth knows, the rank of their covariance and limits; None where it knows none.
 
     A bias without spread, as in the spike of a prior, adds nothing where it is true and makes the NEES infinite
@@ -76,19 +77,19 @@ def of_biases(tree: xr.DataTree, truth: Truth, rate: float) -> tuple[float, int,
     spread = variance > len(variance) * np.finfo(float).eps * variance.max(initial=1.0)
     along = ((error[free] / sd[free]) @ vectors)[spread]
     value = np.inf if (np.abs(error[~free]) > EXACT).any() else float(np.sum(along**2 / variance[spread]))
-    return _judged(value, int(spread.sum()), rate)
+    return _judged(value, int(spread.sum()))
 
 
-def of_all_biases(fit: Judged, truth: Truth, rate: float) -> tuple[float, int, float, float] | None:
+def of_all_biases(fit: Judged, truth: Truth) -> tuple[float, int, float, float] | None:
     """The same where the covariance of all is not held, by their precision; None where the truth lacks one."""
     if not set(fit.problem.labels) <= set(truth.biases):
         return None
     known = np.array([truth.biases[label] for label in fit.problem.labels]) / fit.problem.scales
     error = np.asarray(fit.point.z) - known
     told = np.asarray(fit.expansion.apply(error)) + fit.factors.pull(known) - fit.factors.pull(known + error)
-    return _judged(float(error @ told), len(error), rate)
+    return _judged(float(error @ told), len(error))
 
 
-def _judged(value: float, rank: int, rate: float) -> tuple[float, int, float, float]:
-    lower, upper = special.chdtri(rank, [1 - rate / 2, rate / 2]) if rank else (0.0, 0.0)
+def _judged(value: float, rank: int) -> tuple[float, int, float, float]:
+    lower, upper = special.chdtri(rank, [1 - RATE / 2, RATE / 2]) if rank else (0.0, 0.0)
     return value, rank, float(lower), float(upper)

@@ -2,7 +2,6 @@
 marginalised."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,15 +14,15 @@ from probcal.gaussian.choose import choose
 from probcal.gaussian.engine import Factors
 from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.mode import Point
-from probcal.identifiability.directions import screened_directions, weak_directions
-from probcal.identifiability.gauge import NULL, gauge, unfixed
+from probcal.identifiability.directions import screened_directions, weak_directions, with_kinds
+from probcal.identifiability.gauge import NULL, gauge
 from probcal.identifiability.remedies import WEAK, Direction
 from probcal.linalg import eigenvalues, marginalise
 from probcal.problem import Problem
 from probcal.results.answer import Tracks
 from probcal.results.blocks import SensorBlocks
 from probcal.results.build import bands
-from probcal.results.groups import bias_coords, constant_group, datum_of, direction_group, gather, track_groups
+from probcal.results.groups import along, bias_coords, constant_group, datum_of, direction_group, gather, track_groups
 from probcal.simulate import Truth
 from probcal.types import float64
 
@@ -112,9 +111,7 @@ def _directions(
         found = weak_directions(problem, information, point, null)
         return found, values, null.basis.shape[1] if null.countable else 0, null.countable
     found = weak_directions(problem, information, point)
-    if found:
-        own = unfixed(problem, point, np.stack([direction.vector for direction in found], 1))
-        found = tuple(replace(d, kind="gauge" if free else d.kind) for d, free in zip(found, own, strict=True))
+    found = tuple(with_kinds(problem, point, found)) if found else found
     return found, values, sum(direction.kind == "gauge" for direction in found), True
 
 
@@ -137,7 +134,7 @@ def _biases(problem: Problem, share: np.ndarray, sd: np.ndarray, information: np
         "sd": sd * scales,
         "verdict": np.array([narrowed(own) for own in share]),
     }
-    group = xr.Dataset({k: ("bias_label", v) for k, v in columns.items()}, coords=bias_coords(problem))
+    group = xr.Dataset(along("bias_label", columns), coords=bias_coords(problem))
     if information is None:
         return group
     matrix = (("bias_label", "bias_label_other"), information)

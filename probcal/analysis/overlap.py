@@ -77,9 +77,6 @@ class _Axis(NamedTuple):
     def of(self, x: np.ndarray) -> np.ndarray:
         return np.arcsinh((x - self.centre) / self.width)
 
-    def back(self, u: np.ndarray) -> np.ndarray:
-        return self.centre + self.width * np.sinh(u)
-
 
 class _Part(NamedTuple):
     """Mass within `near` of zero, and the density of the rest over u, with a grid that resolves it."""
@@ -116,8 +113,7 @@ def _normal(mean: float, sd: float, axis: _Axis, share: float, near: float) -> _
     mass = float(np.diff(stats.norm.cdf([-near, near], mean, sd))[0])
 
     def density(u: np.ndarray) -> np.ndarray:
-        x = axis.back(u)
-        slope = axis.width * np.cosh(u)
-        return np.where(np.abs(x) >= near, share * stats.norm.pdf(x, mean, sd) * slope, 0.0)
+        x = axis.centre + axis.width * np.sinh(u)
+        return np.where(np.abs(x) >= near, share * stats.norm.pdf(x, mean, sd) * axis.width * np.cosh(u), 0.0)
 
     return _Part(share * mass, axis.of(np.linspace(mean - REACH * sd, mean + REACH * sd, 513)), density)

@@ -1,22 +1,22 @@
 """Does a bias hold still? A fit of pieces: halves and quarters of the recording, or its targets.
 
-Every piece gets its own copy of the biases and all trajectories are eliminated together, once, at the fit. From
+Biases get differences by piece beside them and all trajectories are eliminated together, once, at the fit. From
 this one information matrix follows, for each bias alone, the generalised least-squares estimate of how it differs
 between the pieces while all others stay common: exact on a linear problem.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.analysis.verdict import limit_of
+from probcal.gaussian.engine import Expansion
 from probcal.inference.fitted import Judged
 from probcal.linalg import invert, pseudo_inverse, solve_square, spectrum
 from probcal.model import variants
-from probcal.problem import Problem
 
-Limit = Callable[[int], float]  # chi-square by degrees of freedom
 Patterns = dict[str, np.ndarray]
 LEAST = 1e-6  # information in z about a difference below which there is none to tell
 
@@ -57,13 +57,32 @@ class Contrast(NamedTuple):
         return float((direction @ self.information @ self.estimate) ** 2) / known if known > LEAST else 0.0
 
 
-def divide(fit: Judged, piece: np.ndarray, count: int) -> Pieces:
-    """Give every piece its own biases; `piece` (rows,) is that of each row of the table, below `count`."""
-    model = variants.split(fit.problem.model, [piece[index] for index in fit.problem.row_index], count)
-    at = fit.engine.at(model, fit.point._replace(z=jnp.asarray(np.tile(fit.point.z, count))), tuple(fit.lins))
+def with_differences(fit: Judged, along: np.ndarray) -> Expansion:
+    """The posterior at a fit with q differences of each bias, all zero, that come on top `along` (rows, q) of the rows
+    of the table.
+
+    After the biases come the differences of the first column, then of the next.
+    """
+    model, own = fit.problem.model, [along[index] for index in fit.problem.row_index]
+    rows = tuple(
+        lin._replace(bias=jnp.concatenate([lin.bias, *(lin.bias * by[:, None, None] for by in times.T)], 2))
+        for *_, lin, times in model.each_block(fit.lins, own)
+    )
+    point = fit.point._replace(z=jnp.pad(fit.point.z, (0, along.shape[1] * model.biases)))
+    return fit.engine.at(variants.differing(model, own), point, rows)
+
+
+def divide(fit: Judged, along: np.ndarray) -> Pieces:
+    """The biases and their differences along columns (rows, q) of the rows of the table."""
+    return of_expansion(fit, with_differences(fit, along))
+
+
+def of_expansion(fit: Judged, at: Expansion) -> Pieces:
+    """The same from `with_differences`, where the engine holds matrices of all biases."""
     information, prior = at.information(), fit.factors.matrix(fit.problem.model.biases)
     assert information is not None
-    return Pieces(information, np.asarray(at.slope()), prior, np.asarray(fit.point.z))
+    level = np.eye(len(information) // len(prior))[0]
+    return Pieces(information, np.asarray(at.slope()), prior, np.asarray(fit.point.z), level)
 
 
 def contrasts(pieces: Pieces, pattern: np.ndarray, free: Sequence[tuple[int, np.ndarray]] = ()) -> dict[int, Contrast]:
@@ -72,19 +91,12 @@ def contrasts(pieces: Pieces, pattern: np.ndarray, free: Sequence[tuple[int, np.
     The biases in `free` differ too, each along its own pattern. What is common has the prior of the fit, the level of
     a bias that differs none. A bias about whose difference the data say nothing is left out.
     """
-    M = len(pieces.z)
-    P, held = len(pieces.score) // M, [m for m, _ in free]
+    M, held = len(pieces.z), [m for m, _ in free]
+    P = len(pieces.score) // M
     level = np.broadcast_to(pieces.level, P)[:, None]
     G, g = pieces.information.reshape(P, M, P, M), pieces.score.reshape(P, M)
-    prior = pieces.prior.copy()
-    prior[held, :], prior[:, held] = 0.0, 0.0
-    # parameters: the M common values, then the coefficients of what differs already
-    to = np.concatenate([np.kron(level, np.eye(M)), *(np.kron(own, np.eye(M)[:, [m]]) for m, own in free)], 1)
+    to, prior, inverse, slope = _together(pieces, free)
     crosses = (pieces.information @ to).reshape(P, M, -1)
-    K, slope = to.T @ pieces.information @ to, to.T @ pieces.score
-    K[:M, :M] += prior
-    slope[:M] -= prior @ pieces.z
-    inverse = pseudo_inverse(K, symmetric=True)
     found = {}
     for m in range(M):
         others, pull, columns = inverse, slope, pattern
@@ -123,39 +135,26 @@ def _contrast(information: np.ndarray, score: np.ndarray, least: float = LEAST) 
     return Contrast(vectors[:, seen] @ ((vectors[:, seen].T @ score) / values[seen]), information, int(seen.sum()))
 
 
+def _together(
+    pieces: Pieces, free: Sequence[tuple[int, np.ndarray]]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Columns, prior (M, M), covariance and slope of the M common values and the coefficients of what is `free`."""
+    M, held = len(pieces.z), [m for m, _ in free]
+    same = np.broadcast_to(pieces.level, len(pieces.score) // M)[:, None]
+    to = np.concatenate([np.kron(same, np.eye(M)), *(np.kron(own, np.eye(M)[:, [m]]) for m, own in free)], 1)
+    prior = pieces.prior.copy()
+    prior[held, :], prior[:, held] = 0.0, 0.0
+    K, slope = to.T @ pieces.information @ to, to.T @ pieces.score
+    K[:M, :M] += prior
+    slope[:M] -= prior @ pieces.z
+    return to, prior, pseudo_inverse(K, symmetric=True), slope
+
+
 def freed(pieces: Pieces, free: Sequence[tuple[int, np.ndarray]]) -> np.ndarray:
     """Change (M,) of what all pieces have in common, in z, where the biases in `free` differ along their patterns."""
-    M, held = len(pieces.z), [m for m, _ in free]
-    same = np.kron(np.broadcast_to(pieces.level, len(pieces.score) // M)[:, None], np.eye(M))
-    steps = []
-    for columns in (same, np.concatenate([same, *(np.kron(own, np.eye(M)[:, [m]]) for m, own in free)], 1)):
-        prior = pieces.prior.copy()
-        if columns is not same:
-            prior[held, :], prior[:, held] = 0.0, 0.0
-        K, slope = columns.T @ pieces.information @ columns, columns.T @ pieces.score
-        K[:M, :M] += prior
-        slope[:M] = slope[:M] - prior @ pieces.z
-        steps.append((pseudo_inverse(K, symmetric=True) @ slope)[:M])
-    change: np.ndarray = steps[1] - steps[0]
+    steps = [inverse @ slope for _, _, inverse, slope in (_together(pieces, own) for own in ((), free))]
+    change: np.ndarray = steps[1][: len(steps[0])] - steps[0]
     return change
-
-
-def own_biases(pieces: Pieces, member: np.ndarray) -> np.ndarray:
-    """Change (P, M) from the fit where groups of pieces, `member` (P,), have own biases, held by their scales."""
-    M = len(pieces.z)
-    to = np.kron(np.eye(int(member.max()) + 1)[member], np.eye(M))
-    step = solve_square(to.T @ pieces.information @ to + np.eye(to.shape[1]), to.T @ pieces.score)
-    return step.reshape(-1, M)[member]
-
-
-def changed(problem: Problem, m: int, estimate: float, sd: float, limit: float) -> str:
-    """By how much the halves of a bias differ, from estimate and sd in z, as the reason of a verdict."""
-    bias = problem.biases[m]
-    unit = f" {bias.unit}" if bias.unit != "1" else ""
-    return (
-        f"second half less first {estimate * bias.scale:.3g} \N{PLUS-MINUS SIGN} {sd * bias.scale:.2g}{unit} "
-        f"({abs(estimate) / sd:.1f} sd, limit {np.sqrt(limit):.1f})"
-    )
 
 
 class Change(NamedTuple):
@@ -167,8 +166,8 @@ class Change(NamedTuple):
     contrast: Contrast
 
 
-def changing(pieces: Pieces, patterns: Patterns, inflation: Patterns, limit: Limit, most: int = 20) -> list[Change]:
-    """Biases whose chi-square along a pattern, over its `inflation` (M,), passes the limit for its freedom.
+def changing(pieces: Pieces, patterns: Patterns, inflation: Patterns, count: int, most: int = 20) -> list[Change]:
+    """Biases whose chi-square along a pattern, over its `inflation` (M,), passes the limit of `count` for its freedom.
 
     The strongest comes first.
 
@@ -183,7 +182,7 @@ def changing(pieces: Pieces, patterns: Patterns, inflation: Patterns, limit: Lim
             Change(m, name, contrast.square / inflation[name][m], contrast)
             for name, pattern in patterns.items()
             for m, contrast in contrasts(pieces, pattern, free).items()
-            if (m, name) not in taken and contrast.square / inflation[name][m] > limit(contrast.freedom)
+            if (m, name) not in taken and contrast.square / inflation[name][m] > limit_of(count, contrast.freedom)
         ]
         if not rest:
             break

@@ -60,14 +60,10 @@ def next_passes(
             with_it = known.copy()
             with_it[np.ix_(met, met)] += added
             found["weak"][k] = _weak(problem, with_it)
-    order = np.argsort(-found["gain"], kind="stable")
     ends = np.linspace(0, paths.shape[1] - 1, min(paths.shape[1], 20)).round().astype(int)
-    columns = {what: ("pass", column[order]) for what, column in found.items()}
-    return xr.Dataset(
-        {**columns, "path": (("pass", "point", "axis"), paths[order][:, ends])},
-        coords={"pass": np.arange(len(order)), "axis": list(AXES[: paths.shape[2]])},
-        attrs=attrs,
-    )
+    found["path"] = paths[:, ends]
+    axes = {"pass": np.arange(len(paths)), "axis": list(AXES[: paths.shape[2]])}
+    return _ranked(("pass", "point", "axis"), found, axes, attrs)
 
 
 @float64
@@ -89,8 +85,9 @@ def next_anchors(
         raise InputError(f"next_anchors: survey={survey} must be positive, a std over the scale of a bias")
     told = Informed.of(problem, point, truth)
     anchors = _anchors(problem)
-    members = _padded(list(anchors.values()), len(problem.labels))
-    there, eye = members < len(problem.labels), np.eye(members.shape[1])
+    M, width = len(problem.labels), max(map(len, anchors.values()))
+    members = np.array([[*group, *[M] * (width - len(group))] for group in anchors.values()])
+    there, eye = members < M, np.eye(width)
     pairs = there[:, :, None] & there[:, None, :]
     covariance = np.where(pairs, told.at.marginals(told.scales, members), 0.0)
     own = 0.5 * log_determinant(eye + covariance / survey**2)
@@ -107,8 +104,9 @@ def next_anchors(
     if told.information is not None:
         attrs["weak_before"] = _weak(problem, told.information)
         columns["weak"] = _weak_after(problem, told.information, members[kept], survey)
-    names = list(anchors)
-    return _ranked(problem, {names[k]: anchors[names[k]] for k in kept}, columns, attrs)
+    columns["unit"] = np.array([problem.biases[m].unit for m in members[kept, 0]], str)
+    columns["anchor"] = np.array(list(anchors))[kept]
+    return _ranked(("anchor",), columns, {}, attrs)
 
 
 def _weak_after(problem: Problem, information: np.ndarray, members: np.ndarray, survey: float) -> np.ndarray:
@@ -131,22 +129,12 @@ def _others_known(told: Informed, members: np.ndarray) -> np.ndarray:
 
 
 def _ranked(
-    problem: Problem, groups: dict[str, list[int]], columns: dict[str, np.ndarray], attrs: dict[str, Any]
+    dims: tuple[str, ...], columns: dict[str, np.ndarray], coords: dict[str, Any], attrs: dict[str, Any]
 ) -> xr.Dataset:
-    """Anchors with what is known of each, the largest gain first."""
-    order = np.lexsort((-columns["own"], -columns["gain"]))
-    return xr.Dataset(
-        {name: ("anchor", column[order]) for name, column in columns.items()}
-        | {"unit": ("anchor", np.array([problem.biases[g[0]].unit for g in groups.values()], str)[order])},
-        coords={"anchor": np.array(list(groups))[order]},
-        attrs=attrs,
-    )
-
-
-def _padded(groups: list[list[int]], blank: int) -> np.ndarray:
-    """Groups (B, p) of numbers, filled up behind."""
-    width = max(map(len, groups))
-    return np.array([[*group, *[blank] * (width - len(group))] for group in groups])
+    """Candidates, the first dimension, with what is known of each, the largest gain first."""
+    order = np.lexsort((-columns.get("own", columns["gain"]), -columns["gain"]))
+    found = {name: (dims[: column.ndim], column[order]) for name, column in columns.items()}
+    return xr.Dataset(found, coords, attrs)
 
 
 def _anchors(problem: Problem) -> dict[str, list[int]]:
@@ -182,16 +170,11 @@ def next_sensors(
     places = _grid(problem, told.point) if places is None else np.asarray(places, float)
     if places.ndim != 2 or places.shape[1] != d or not np.isfinite(places).all():
         raise InputError(f"places has shape {places.shape}; give (places, {d}) of finite numbers")
-    found = []
-    for kind in problem.network.types:
-        gains = gains_of_sensors(told, kind, places)
-        found += [(kind.name, gain, place) for gain, place in zip(gains, places, strict=True)]
-    found.sort(key=lambda row: -row[1])
-    return xr.Dataset(
-        {"gain": ("candidate", [gain for _, gain, _ in found]), "type": ("candidate", [name for name, *_ in found]),
-         "place": (("candidate", "axis"), np.stack([place for *_, place in found]))},
-        coords={"axis": list(AXES[:d])},
-    )  # fmt: skip
+    kinds = problem.network.types
+    columns = {"gain": np.concatenate([gains_of_sensors(told, kind, places) for kind in kinds])}
+    columns["type"] = np.repeat([kind.name for kind in kinds], len(places))
+    columns["place"] = np.tile(places, (len(kinds), 1))
+    return _ranked(("candidate", "axis"), columns, {"axis": list(AXES[:d])}, {})
 
 
 def _weak(problem: Problem, information: np.ndarray) -> int:
@@ -262,13 +245,11 @@ def _candidates(problem: Problem, point: Point, epochs: int) -> np.ndarray:
         return _grid(problem, point)[:, None]
     low, high = _area(problem, point)
     centre, radius = (low + high) / 2, float(np.linalg.norm((high - low)[:2])) / 2
-    along = np.linspace(-radius, radius, epochs)
-    paths = []
-    for angle in np.pi * np.arange(HEADINGS) / HEADINGS:
-        ahead, left = np.zeros(len(low)), np.zeros(len(low))
-        ahead[:2], left[:2] = (np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))
-        paths += [centre + lane * radius * left + along[:, None] * ahead for lane in LANES]
-    return np.stack(paths)
+    angle = np.pi * np.arange(HEADINGS) / HEADINGS
+    cos, sin, level = np.cos(angle), np.sin(angle), np.zeros((HEADINGS, len(low) - 2))
+    ahead, left = (np.column_stack([*own, level])[:, None, None] for own in ((cos, sin), (-sin, cos)))
+    lanes, along = (np.array(LANES) * radius)[:, None, None], np.linspace(-radius, radius, epochs)[:, None]
+    return (centre + lanes * left + along * ahead).reshape(-1, epochs, len(low))
 
 
 def _travelled(passes: Any, time: np.ndarray) -> np.ndarray:

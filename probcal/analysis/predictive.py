@@ -85,12 +85,12 @@ def check_replicas(fit: Judged, drawn: FitDraws, key: jax.Array) -> Predictive:
     count = len(problem.network.sensors)
     found, fourth = _discrepancies(problem.model, fit.point.levels, drawn, sensors, count, key)
     kurtosis = np.zeros(len(fit.data)) if gaussian else exact_kurtosis(fit, fit.flat(fourth) - 3.0)
-    parts: tuple[list[Any], list[Any]] = ([], [])
+    parts = list[np.ndarray]()
     for sensor, values in zip(sensors, map(np.asarray, found), strict=True):
         above = (values[:, 1] > values[:, 0]).mean(0) + 0.5 * (values[:, 1] == values[:, 0]).mean(0)  # (S, 2, C)
-        for k, part in enumerate(parts):
-            part.append(above[np.asarray(sensor), k])
-    return Predictive(fit.flat(parts[0]), fit.flat(parts[1]), kurtosis, drawn.z.shape[0])
+        parts.append(np.moveaxis(above[np.asarray(sensor)], 1, 0))
+    misfit, mean = fit.flat(parts)
+    return Predictive(misfit, mean, kurtosis, drawn.z.shape[0])
 
 
 def draws_of(fit: Judged, tree: xr.DataTree, key: jax.Array) -> FitDraws:

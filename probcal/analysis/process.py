@@ -5,15 +5,13 @@ Smoothing shrinks noises and mixes neighbours, so both are compared with what th
 linearised model draws: neither depends on the level of the noise.
 """
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any
 
-import jax
 import numpy as np
 
+from probcal.analysis.check import Case, Checked, check
 from probcal.analysis.findings import Finding
 from probcal.gaussian.draws import simulated
-from probcal.inference.fitted import Judged
 from probcal.motion.base import GAUSSIAN, Component, level_name
 from probcal.noise import Normal, guess_of
 
@@ -25,64 +23,48 @@ HEAVIER, TOGETHER = 1.3, 0.2  # times the kurtosis, and correlation, from which 
 HELD = 0.05  # sd of a smoothed noise, 1 before the data, below which these say nothing of it
 
 
-class Driven(NamedTuple):
-    """The noises of one component of one target."""
-
-    name: str  # of the target
-    component: str  # what they drive
-    family: str  # its class, for the remedy
-    next_order: str  # what to declare instead where the noise has a memory
-    noises: np.ndarray  # (epochs, entries) over the sd of the replicas
-    replicas: np.ndarray  # (epochs, entries, D) likewise
-
-
-def check_process_noise(fit: Judged, key: jax.Array) -> list[Finding]:
+@check("explained", "factor")
+def check_process(case: Case) -> Checked:
     """Findings on the process noises of every target whose motion declares Gaussian ones."""
-    size = max(sum(part.drift.size for part in fit.problem.model.recursions), 1)
-    count = int(min(REPLICAS, MOST / size))
-    found = []
-    for own in _driven(fit, key, count) if count >= FEWEST else ():
-        heavy, expected, away = _compared(_kurtosis(own.noises), _kurtosis(own.replicas))
-        where = f'target "{own.name}": the noise of its {own.component}'
-        if away > LIMIT and heavy > HEAVIER * expected:
-            text = (
-                f"{where} has heavy tails (kurtosis {heavy:.1f}, {expected:.1f} expected): declare"
-                f" {own.family}(..., noise=StudentT(4))"
-            )
-            found.append(Finding("motion", own.name, text))
-            continue
-        lags = range(1, min(LAGS, len(own.noises) // 3) + 1)
-        tried = [(lag, *_compared(_correlation(own.noises, lag), _correlation(own.replicas, lag))) for lag in lags]
-        lag, value, usual, far = max(tried, key=lambda one: one[3])
-        if far > LIMIT and value - usual > TOGETHER:
-            text = (
-                f"{where} is correlated in time ({value:.2f} at lag {lag}, {usual:.2f} expected): declare"
-                f" {own.next_order}"
-            )
-            found.append(Finding("motion", own.name, text))
-    return found
-
-
-def _driven(fit: Judged, key: jax.Array, count: int) -> Iterator[Driven]:
-    """The noises that the data say something of, those of a start left out."""
-    problem = fit.problem
+    problem, found = case.fit.problem, list[Finding]()
+    count = int(min(REPLICAS, MOST / max(sum(part.drift.size for part in problem.model.recursions), 1)))
+    if count < FEWEST:
+        return Checked()
     still = [np.zeros((*part.drift.shape, count)) for part in problem.model.recursions]
-    drawn = [smooth.noises for _, smooth in simulated(fit.expansion, still, key)]
-    for name, _, part, smoothed, columns in problem.tracks(problem.model.recursions, fit.point.noises, drawn):
+    drawn = [smooth.noises for _, smooth in simulated(case.fit.expansion, still, case.keys[2])]
+    for name, _, part, smoothed, columns in problem.tracks(problem.model.recursions, case.fit.point.noises, drawn):
         mine, active = ~part.first, part.L.any(1)
         for component, own in problem.noise_columns(name):
             gaussian = isinstance(getattr(component, "noise", GAUSSIAN), Normal)
             if not gaussian or guess_of(component.std) == 0 or mine.sum() < FEWEST:
                 continue
             sd = columns[mine, own].std(2)
-            told = active[mine, own] & (sd > HELD)
+            told = active[mine, own] & (sd > HELD)  # what the data say something of, no start
             if told.any(1).sum() < FEWEST:
                 continue
             scale = np.where(told, 1.0 / np.where(told, sd, 1.0), 0.0)
-            drives = level_name(component).removesuffix("_std")
-            own_noises = smoothed[mine, own] * scale, columns[mine, own] * scale[:, :, None]
-            order = getattr(component, "next_order", Component.next_order)
-            yield Driven(name, drives, type(component).__name__, order, *own_noises)
+            if text := _unlike(component, smoothed[mine, own] * scale, columns[mine, own] * scale[:, :, None]):
+                drives = level_name(component).removesuffix("_std")
+                found.append(Finding("motion", name, f'target "{name}": the noise of its {drives} {text}'))
+    return Checked(findings=found)
+
+
+def _unlike(component: Any, noises: np.ndarray, replicas: np.ndarray) -> str:
+    """The difference between noises (epochs, entries) and their replicas (epochs, entries, D).
+
+    Both are over the sd of the replicas; the text says what to declare.
+    """
+    heavy, expected, away = _compared(_kurtosis(noises), _kurtosis(replicas))
+    if away > LIMIT and heavy > HEAVIER * expected:
+        declared = f"{type(component).__name__}(..., noise=StudentT(4))"
+        return f"has heavy tails (kurtosis {heavy:.1f}, {expected:.1f} expected): declare {declared}"
+    lags = range(1, min(LAGS, len(noises) // 3) + 1)
+    tried = [(lag, *_compared(_correlation(noises, lag), _correlation(replicas, lag))) for lag in lags]
+    lag, value, usual, far = max(tried, key=lambda one: one[3])
+    if far > LIMIT and value - usual > TOGETHER:
+        order = getattr(component, "next_order", Component.next_order)
+        return f"is correlated in time ({value:.2f} at lag {lag}, {usual:.2f} expected): declare {order}"
+    return ""
 
 
 def _kurtosis(noises: np.ndarray) -> np.ndarray:

@@ -1,16 +1,15 @@
 """Parts of a recording and groups of targets between which biases may differ, and which of them do.
 
-Where the engine holds matrices of all biases every part has its own copy of each (`pieces`).
-Elsewhere the biases have differences beside them which factors hold at zero: their marginals and
-means tell the score test of each bias alone. Those that it suspects are then compared together, all
-others eliminated.
+The biases have differences by part and by group beside them, trajectories eliminated. Where the engine holds matrices
+of all biases these are compared by them. Elsewhere factors hold the differences at zero, whose marginals and means tell
+the score test of each bias alone; those that it suspects are then compared together, all others eliminated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from functools import partial
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -18,16 +17,18 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from probcal.analysis import pieces
+from probcal.analysis import levels, pieces
+from probcal.analysis.check import Case, Checked, check
+from probcal.analysis.findings import Finding
 from probcal.analysis.pieces import Change, Contrast, Patterns, Pieces
 from probcal.analysis.verdict import RATE, limit_of
-from probcal.gaussian.engine import Expansion, Factors, Group
+from probcal.gaussian.engine import Factors, Group, told_alone
 from probcal.inference import residuals
 from probcal.inference.fitted import Judged
+from probcal.labels import listed
 from probcal.linalg import invert
-from probcal.model import variants
 from probcal.problem import Problem
-from probcal.results.groups import bias_coords
+from probcal.results.groups import along, bias_coords
 
 QUARTERS = 4
 COPIES = 2000  # most biases of all pieces together
@@ -46,39 +47,25 @@ class Grid(NamedTuple):
     groups: int
 
     @property
-    def piece(self) -> np.ndarray:
-        """Piece (rows,) of each row."""
-        return self.part * self.groups + self.group
+    def along(self) -> np.ndarray:
+        """The differences (rows, q) of each row: by the parts after the first, then by the groups after the first."""
+        return np.concatenate([np.eye(len(self.edges))[self.part][:, 1:], np.eye(self.groups)[self.group][:, 1:]], 1)
 
     @property
-    def pieces(self) -> int:
-        """Their number."""
-        return len(self.edges) * self.groups
-
-    @property
-    def quarters(self) -> np.ndarray:
-        """The part that each piece is, (pieces, parts - 1)."""
-        return np.kron(np.eye(len(self.edges))[:, 1:], np.ones((self.groups, 1)))
+    def columns(self) -> dict[str, np.ndarray]:
+        """The numbers of the differences, from 1 on, between the "halves" and between the "targets"."""
+        parts = len(self.edges)
+        every = {"halves": np.arange(1, parts), "targets": np.arange(parts, parts + self.groups - 1)}
+        return {name: own for name, own in every.items() if len(own)}
 
     @property
     def patterns(self) -> Patterns:
-        """Differences: of halves (pieces, 1), of targets (pieces, groups - 1)."""
-        found, parts = {}, len(self.edges)
-        if parts > 1:
-            found["halves"] = np.repeat(2 * np.arange(parts) // parts, self.groups)[:, None].astype(float)
-        if self.groups > 1:
-            found["targets"] = np.kron(np.ones((parts, 1)), np.eye(self.groups)[:, 1:])
-        return found
-
-    @property
-    def members(self) -> Patterns:
-        """Members (pieces,) with biases of their own while the noise behind a pattern is measured."""
-        parts = len(self.edges)
-        every = {
-            "halves": np.repeat(np.arange(parts), self.groups),
-            "targets": np.tile(np.arange(self.groups), parts),
+        """The bias and its differences (1 + q, k) for a unit change: of halves k = 1, of targets groups - 1."""
+        parts, every = len(self.edges), np.eye(len(self.edges) + self.groups - 1)
+        return {
+            name: every[:, own] if name == "targets" else every[:, own[2 * own // parts > 0]].sum(1, keepdims=True)
+            for name, own in self.columns.items()
         }
-        return {name: every[name] for name in self.patterns}
 
 
 class Compared(NamedTuple):
@@ -92,10 +79,51 @@ class Compared(NamedTuple):
     unsolved: int  # biases that may differ and were not compared with others
 
 
+@check("explained", "factor")
+def check_segments(case: Case) -> Checked:
+    """What each bias would change from the first half of the recording to the second, and which of them do.
+
+    Biases drift, targets disagree on them, or they would move by more than `levels.HANGS` sd if others may change.
+    """
+    grid = grid_for(case.fit)
+    compared = compare_segments(case.fit, case.filtered, case.channels, grid) if grid.columns else None
+    if compared is None:
+        return Checked()
+    problem, inflation, changes = case.fit.problem, compared.inflation, compared.changes
+    M = problem.model.biases
+    limit, groups, findings = limit_of(M), {}, []
+    if compared.alone:
+        groups["halves"] = group_of(problem, compared, grid)
+    drifts, disagreements, remarks, weak = dict[int, str](), dict[int, str](), dict[int, str](), dict[int, str]()
+    for bias, name, square, contrast in changes:
+        if name == "halves":
+            sd = float(np.sqrt(inflation[bias] / contrast.information[0, 0]))
+            text = changed(problem, bias, float(contrast.estimate[0]), sd, limit)
+            drifts[bias] = text + _shape(compared.shapes.get(bias), grid.edges)
+        else:
+            disagreements[bias] = _disagreement(problem, contrast, square, limit_of(M, contrast.freedom))
+    if changes:
+        labels = [problem.labels[change.bias] for change in changes]
+        moved = np.abs(compared.moved / np.maximum(case.fit.sd, 1e-150))
+        others = listed(labels, 1)
+        for m in np.flatnonzero(moved > levels.HANGS).tolist():
+            weak[m] = f"it would move by {moved[m]:.1f} sd if {others} may change"
+        for m, one in compared.alone.items():
+            if one.square / inflation[m] > limit and m not in (changes[0].bias, *drifts):
+                size = np.sqrt(one.square / inflation[m])
+                remarks[m] = f"; its halves differ by {size:.1f} sd, which {labels[0]} explains"
+    if compared.unsolved:
+        text = "more biases may have changed and were not compared: so many are rarely drifts of single biases"
+        findings.append(Finding("halves", "fit", f"{compared.unsolved} {text}"))
+    doubts = {"drifting": drifts, "conflicting": disagreements, "weak": weak}
+    return Checked(groups, findings, doubts, ["levels"] * bool(drifts), inflation, remarks)
+
+
 def grid_for(fit: Judged) -> Grid:
     """Quarters of equal numbers of rows by targets; halves, and groups, where biases are many."""
     data, M = fit.problem.measurements, fit.problem.model.biases
-    edges = _edges(data.time[data.measured.any(1)], QUARTERS if QUARTERS * M <= COPIES else 2)
+    whole = fit.engine.cheap and QUARTERS * M <= COPIES
+    edges = _edges(data.time[data.measured.any(1)], QUARTERS if whole else 2)
     most = COPIES // (len(edges) * M) if fit.engine.cheap else PARAMETERS // M - 1
     groups = max(1, min(len(data.target_names), most))
     return Grid(np.searchsorted(edges[1:], data.time, side="right"), data.target % groups, edges, groups)
@@ -127,71 +155,32 @@ def compare_segments(
         return residuals.inflation(fit, wide.size * wide.memory, channels.group)
 
     with suppress(MemoryError, np.linalg.LinAlgError):
-        by = _ByPieces(fit, grid) if fit.engine.cheap else _ByDifferences(fit, grid)
-        return by.compared({name: inflation(by.own_shift(name)) for name in grid.patterns})
+        by = _Differences(fit, grid)
+        return by.compared({name: inflation(by.own_shift(name)) for name in grid.columns})
     return None
 
 
-class _ByPieces:
-    """By matrices of the biases of all pieces."""
+class _Differences:
+    """The expansion in which every bias may differ by q more: the M biases, then their differences."""
 
     def __init__(self, fit: Judged, grid: Grid):
-        self.fit, self.grid, self.divided = fit, grid, pieces.divide(fit, grid.piece, grid.pieces)
-
-    def own_shift(self, name: str) -> list[jax.Array]:
-        """Shift of the biases (N, p) of each row where each member of a pattern has its own."""
-        own, model = pieces.own_biases(self.divided, self.grid.members[name]), self.fit.problem.model
-        step = np.concatenate([own, np.zeros((len(own), 1))], 1)
-        rows = model.each_block(self.fit.problem.row_index, model.read)
-        return [jnp.asarray(step[self.grid.piece[index][:, None], bias]) for *_, index, bias in rows]
-
-    def compared(self, wide: Patterns) -> Compared:
-        """The differences, with the inflation (M,) of each pattern."""
-        divided, grid, M = self.divided, self.grid, self.fit.problem.model.biases
-        alone = pieces.contrasts(divided, grid.patterns["halves"]) if "halves" in wide else {}
-        changes = pieces.changing(divided, grid.patterns, wide, partial(limit_of, M))
-        shapes = pieces.contrasts(divided, grid.quarters) if changes and grid.quarters.shape[1] > 1 else {}
-        free = [(change.bias, grid.patterns[change.name]) for change in changes]
-        moved = pieces.freed(divided, free) if changes else np.zeros(M)
-        return Compared(alone, wide.get("halves", np.ones(M)), changes, moved, shapes, 0)
-
-
-class _ByDifferences:
-    """By an expansion in which every bias may differ by q more, held at zero by factors.
-
-    The parameters are the M biases, then their differences, those of halves first.
-    """
-
-    def __init__(self, fit: Judged, grid: Grid):
-        model, M = fit.problem.model, fit.problem.model.biases
-        self.fit, self.columns = fit, dict[str, list[int]]()
-        along = list[np.ndarray]()
-        for name, pattern in grid.patterns.items():
-            self.columns[name] = [1 + len(along) + j for j in range(pattern.shape[1])]
-            along += list(pattern[grid.piece].T)
-        self.along = [np.stack([own[index] for own in along], 1) for index in fit.problem.row_index]
-        rows = tuple(
-            lin._replace(bias=jnp.concatenate([lin.bias, *(lin.bias * by[:, None, None] for by in own.T)], 2))
-            for *_, lin, own in model.each_block(fit.lins, self.along)
-        )
-        point = fit.point._replace(z=jnp.concatenate([fit.point.z, jnp.zeros(self.q * M)]))
-        self.at: Expansion = fit.engine.at(variants.differing(model, self.along), point, rows)
-        self.alpha, self.z = fit.factors.diagonal(M), np.asarray(point.z)
-        self.held = HELD * (1.0 + residuals.told_alone(fit))
+        M, along = fit.problem.model.biases, grid.along
+        self.fit, self.grid, self.q, self.at = fit, grid, along.shape[1], pieces.with_differences(fit, along)
+        self.alpha, self.z = fit.factors.diagonal(M), np.asarray(self.at.point.z)
+        self.held = HELD * (1.0 + told_alone(fit.expansion))
         self.prior = np.concatenate([self.alpha, np.tile(self.held, self.q)])
         self.pinned = Factors.alone(self.prior)
-        self.step = self._mean(self.pinned)
 
-    @property
-    def q(self) -> int:
-        """Differences of each bias."""
-        return self.along[0].shape[1]
+    @cached_property
+    def step(self) -> np.ndarray:
+        """The step of all parameters to their mean, the differences held at zero."""
+        return self._mean(self.pinned)
 
     def _mean(self, factors: Factors) -> np.ndarray:
         """The step of all parameters from the fit to their mean."""
         return np.asarray(self.at.solve(factors, np.asarray(self.at.slope()) + factors.pull(self.z)))
 
-    def _places(self, biases: np.ndarray, columns: Sequence[int]) -> np.ndarray:
+    def _places(self, biases: np.ndarray, columns: Sequence[int] | np.ndarray) -> np.ndarray:
         """Places (biases, columns) of biases and differences; column 0 is the bias itself."""
         return biases[:, None] + len(self.alpha) * np.asarray(columns)
 
@@ -205,51 +194,59 @@ class _ByDifferences:
         return inverse - np.asarray(own)[..., None] * np.eye(members.shape[1]), score
 
     def own_shift(self, name: str) -> list[jax.Array]:
-        """Shift of the biases (N, p) of each row where each member of a pattern has its own."""
-        M, columns = len(self.alpha), [0, *self.columns[name]]
+        """Shift of the biases (N, p) of each row where each member of a pattern has its own, of their scales."""
+        M, columns = len(self.alpha), [0, *self.grid.columns[name]]
         copies = np.eye(len(columns))
         copies[:, 0] = 1.0  # each is the bias and its difference
         members = self._places(np.arange(M), columns)
         precision = np.broadcast_to(copies.T @ copies, (M, *copies.shape))
-        pinned = np.where(np.isin(np.arange(len(self.prior)), members), 0.0, self.prior)
+        pinned = np.where(np.isin(np.arange(len(self.prior)), members), 0.0, HELD * self.prior)
         factors = Factors((Group(members, precision, np.zeros(members.shape)),)) + Factors.alone(pinned)
-        step = np.append(self.at.solve(factors, self.at.slope()), 0.0).reshape(-1)
-        every = np.concatenate([step[:-1].reshape(1 + self.q, M), np.zeros((1 + self.q, 1))], 1)
+        step = np.pad(np.reshape(self.at.solve(factors, self.at.slope()), (-1, M)), ((0, 0), (0, 1)))
+        times = np.pad(self.grid.along, ((0, 0), (1, 0)), constant_values=1.0)[:, columns]
         model = self.fit.problem.model
+        parts = model.each_block(self.fit.problem.row_index, model.read)
         return [
-            jnp.asarray(every[0][read] + sum(own[:, [j - 1]] * every[j][read] for j in columns[1:]))
-            for *_, own, read in model.each_block(self.along, model.read)
+            jnp.asarray(sum(times[own][:, [k]] * step[j][read] for k, j in enumerate(columns)))
+            for *_, own, read in parts
         ]
 
-    def _alone(self, name: str) -> dict[int, Contrast]:
+    def _alone(self, name: str) -> Iterator[tuple[int, Contrast]]:
         """The difference of each bias alone, all others common."""
-        M, columns = len(self.alpha), [*self.columns[name], 0]
-        members = self._places(np.arange(M), columns)
+        members = self._places(np.arange(len(self.alpha)), [*self.grid.columns[name], 0])
         information, score = self._told(self.pinned, self.step, members, self.prior[members])
-        least = self.held * 1e-9  # a thousandth of what is told with all else known
-        found = (pieces.beside_level(a, b, floor) for a, b, floor in zip(information, score, least, strict=True))
-        return {m: one for m, one in enumerate(found) if one is not None}
+        for m, own in enumerate(zip(information, score, self.held * 1e-9, strict=True)):
+            found = pieces.beside_level(*own)  # from a thousandth of what is told with all else known
+            if found is not None:
+                yield m, found
 
     def compared(self, wide: Patterns) -> Compared:
         """The differences, with the inflation (M,) of each pattern."""
-        M = len(self.alpha)
-        each = {name: self._alone(name) for name in self.columns}
-        over = np.zeros(M)  # share of the limit
-        for name, found in each.items():
-            for m, one in found.items():
-                over[m] = max(over[m], one.square / wide[name][m] / limit_of(M, one.freedom))
-        suspects = np.argsort(-over)[: np.count_nonzero(over > SUSPECT)]
-        chosen = np.sort(suspects[: TOGETHER // (1 + self.q)])
-        changes, moved = list[Change](), np.zeros(M)
-        if (over > 1.0).any():
-            patterns = {name: np.eye(1 + self.q)[:, own] for name, own in self.columns.items()}
-            here = {name: own[chosen] for name, own in wide.items()}
-            among = pieces.changing(self._of(chosen), patterns, here, partial(limit_of, M))
-            changes = [change._replace(bias=int(chosen[change.bias])) for change in among]
-            moved = self._moved(changes)
-        return Compared(
-            each.get("halves", {}), wide.get("halves", np.ones(M)), changes, moved, {}, len(suspects) - len(chosen)
-        )
+        M, patterns, changes, shapes = len(self.alpha), self.grid.patterns, list[Change](), dict[int, Contrast]()
+        moved, unsolved = np.zeros(M), 0
+        if self.fit.engine.cheap:
+            divided = pieces.of_expansion(self.fit, self.at)
+            alone = pieces.contrasts(divided, patterns["halves"]) if "halves" in wide else {}
+            changes = pieces.changing(divided, patterns, wide, M)
+            quarters = self.grid.columns.get("halves", np.zeros(0, int))
+            if changes and len(quarters) > 1:
+                shapes = pieces.contrasts(divided, np.eye(1 + self.q)[:, quarters])
+            moved = pieces.freed(divided, [(own.bias, patterns[own.name]) for own in changes]) if changes else moved
+        else:
+            each = {name: dict(self._alone(name)) for name in wide}
+            over, alone = np.zeros(M), each.get("halves", {})  # share of the limit
+            for name, found in each.items():
+                for m, one in found.items():
+                    over[m] = max(over[m], one.square / wide[name][m] / limit_of(M, one.freedom))
+            suspects = np.argsort(-over)[: np.count_nonzero(over > SUSPECT)]
+            chosen = np.sort(suspects[: TOGETHER // (1 + self.q)])
+            if (over > 1.0).any():
+                here = {name: own[chosen] for name, own in wide.items()}
+                among = pieces.changing(self._of(chosen), patterns, here, M)
+                changes = [change._replace(bias=int(chosen[change.bias])) for change in among]
+                moved = self._moved(changes)
+            unsolved = len(suspects) - len(chosen)
+        return Compared(alone, wide.get("halves", np.ones(M)), changes, moved, shapes, unsolved)
 
     def _of(self, biases: np.ndarray) -> Pieces:
         """Some biases and their differences, all others eliminated."""
@@ -265,9 +262,8 @@ class _ByDifferences:
         """By how much what all have in common moves where biases may change."""
         freed = self.prior.copy()
         for change in changes:
-            freed[self._places(np.array([change.bias]), [0, *self.columns[change.name]])] = 0.0
-        M = len(self.alpha)
-        return (self._mean(Factors.alone(freed)) - self.step)[:M]
+            freed[self._places(np.array([change.bias]), [0, *self.grid.columns[change.name]])] = 0.0
+        return (self._mean(Factors.alone(freed)) - self.step)[: len(self.alpha)]
 
 
 def group_of(problem: Problem, compared: Compared, grid: Grid) -> xr.Dataset:
@@ -277,7 +273,35 @@ def group_of(problem: Problem, compared: Compared, grid: Grid) -> xr.Dataset:
     change = np.array([compared.alone[m].estimate[0] for m in index]) * scale
     sd = np.sqrt(compared.inflation[index] / np.array([compared.alone[m].information[0, 0] for m in index])) * scale
     columns = {"change": change, "sd": sd, "t": change / sd}
-    group = xr.Dataset({name: ("bias_label", own) for name, own in columns.items()}, bias_coords(problem, index))
+    group = xr.Dataset(along("bias_label", columns), bias_coords(problem, index))
     group.attrs |= {"time": float(grid.edges[len(grid.edges) // 2]), "rate": RATE}
     group.attrs["limit"] = float(np.sqrt(limit_of(problem.model.biases)))
     return group
+
+
+def changed(problem: Problem, m: int, estimate: float, sd: float, limit: float) -> str:
+    """By how much the halves of a bias differ, from estimate and sd in z, as the reason of a verdict."""
+    bias = problem.biases[m]
+    unit = f" {bias.unit}" if bias.unit != "1" else ""
+    return (
+        f"second half less first {estimate * bias.scale:.3g} \N{PLUS-MINUS SIGN} {sd * bias.scale:.2g}{unit} "
+        f"({abs(estimate) / sd:.1f} sd, limit {np.sqrt(limit):.1f})"
+    )
+
+
+def _shape(shape: Contrast | None, edges: np.ndarray) -> str:
+    """Whether quarters tell of a jump, and where, or of a drift."""
+    if shape is None:
+        return ""
+    later = np.arange(1, len(edges))
+    shapes = {f"it jumps at about {edges[k]:.4g} s": 1.0 * (later >= k) for k in later} | {"it drifts": 1.0 * later}
+    return f"; {max(shapes, key=lambda name: shape.along(shapes[name]))}"
+
+
+def _disagreement(problem: Problem, contrast: Contrast, square: float, limit: float) -> str:
+    """Reason of a bias on which the targets disagree, with the one that is most out of line."""
+    names, groups = problem.measurements.target_names, len(contrast.estimate) + 1
+    alone = [contrast.along(unit[1:] - unit[0]) for unit in np.eye(groups)]
+    odd = [name for k, name in enumerate(names) if k % groups == int(np.argmax(alone))]
+    most = f"{names[0]} and {names[1]}" if len(names) == 2 else f"{listed(odd, 1)} most"
+    return f"the targets disagree, {most} (chi-square {square:.1f} on {contrast.freedom}, limit {limit:.1f})"

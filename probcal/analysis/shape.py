@@ -6,11 +6,10 @@ fall without limit: bearings of an array that is small beside the distance tell 
 """
 
 import jax
-import xarray as xr
 
+from probcal.analysis.check import Case, Checked, check
 from probcal.analysis.findings import Finding
 from probcal.gaussian.mode import log_likelihood
-from probcal.inference.fitted import Judged
 from probcal.results.read import summed_log_likelihood
 
 LINEAR, MOST = 0.5, 0.75  # nats a datum: at most of a linear model, and from which it is a finding
@@ -19,18 +18,20 @@ GAUSSIAN = ("Laplace", "mixture")  # kinds of answers that draw from Gaussians a
 _log_likelihood = jax.jit(log_likelihood)
 
 
-def check_shape(fit: Judged, tree: xr.DataTree) -> Finding | None:
-    """A finding where the draws of a Gaussian answer fit the data far worse than its mode."""
-    drawn = summed_log_likelihood(tree)
-    if tree.attrs["approximate"] not in GAUSSIAN or drawn is None:
-        return None
+@check("answer")
+def check_shape(case: Case) -> Checked:
+    """A finding where the draws of a Gaussian answer fit the data far worse than its mode; then no interval counts."""
+    fit, drawn = case.fit, summed_log_likelihood(case.tree)
+    if case.tree.attrs["approximate"] not in GAUSSIAN or drawn is None:
+        return Checked()
     mode = float(_log_likelihood(fit.problem.untilted.model, fit.point))  # draws are those of rows alone
     fall = (mode - float(drawn.median())) / len(fit.data)
     if not fall > MOST:
-        return None
+        return Checked()
     text = (
         f"the answer is far from Gaussian: at its draws the data fit {fall:.2g} nats a datum worse than at its mode"
         f" ({LINEAR:g} at most if it were), so its intervals are not valid; state where each target starts,"
         " Target(motion, start=...), and compare with NUTS()"
     )
-    return Finding("shape", "fit", text)
+    every = dict.fromkeys(range(fit.problem.model.biases), "the answer is far from Gaussian: its interval is not valid")
+    return Checked(findings=[Finding("shape", "fit", text)], doubts={"weak": every})

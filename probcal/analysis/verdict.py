@@ -33,7 +33,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import special
 
-from probcal.linalg import invert
 from probcal.problem import Problem
 from probcal.status import Status
 
@@ -44,20 +43,17 @@ PART = 0.1
 VERDICTS = ("determined", "prior only", "weak", "drifting", "conflicting")
 
 
+Doubts = Mapping[str, Mapping[int, str]]  # reason by bias, by the verdict that it is for
+
+
 class Grounds(NamedTuple):
     """What the verdicts rest on, each (M,) in z."""
 
     contraction: np.ndarray  # s
-    square: np.ndarray  # of halves alike, over its limit's chi-square, 0 where nothing can be told
     pull: np.ndarray  # sd from the prior, 0 where the prior follows the data
-    limit: float  # of pull and of the root of `square`
+    limit: float  # of pull
     # share of the chi-square that the innovations have too much which the bias alone explains
     part: Any = 1.0
-
-
-def contraction(information: np.ndarray) -> np.ndarray:
-    """How much the data narrow each bias in units of its declared scale, s = 1 - [(G + I)^-1]_mm."""
-    return np.clip(1.0 - np.diag(invert(information + np.eye(len(information)))), 0.0, 1.0)
 
 
 def narrowed(share: float) -> str:
@@ -94,18 +90,18 @@ def judge_biases(
     status: Status,
     ended: Sequence[str],
     known: Grounds,
-    drifts: Mapping[int, str],
-    disagreements: Mapping[int, str],
-    first: str,
-    shared: Mapping[int, str],
-    doubts: Mapping[int, str] = MappingProxyType({}),
+    doubts: Doubts,
+    remarks: Mapping[int, str] = MappingProxyType({}),
 ) -> tuple[list[str], list[str]]:
-    """Verdict and reason of every bias, from the evidence and the reasons of those that change, `first` most.
+    """Verdict and reason of every bias, from the evidence and the doubts of the checks, by the verdict they are for.
 
-    `status` is that of the fit, `ended` that of each bias, `shared` the open combination that some belong to,
-    `doubts` why the answer of some is not one bell: another answer that fits as well, or draws that fit badly.
+    `status` is that of the fit, `ended` that of each bias, `remarks` are added to the reason of a bias.
     """
     verdicts, sentences = [], []
+
+    def charged(word: str, m: int) -> list[tuple[bool, str, str]]:
+        return [(True, word, doubts[word][m])] if m in doubts.get(word, {}) else []
+
     explained = np.broadcast_to(known.part, len(problem.biases))
     for m, bias in enumerate(problem.biases):
         s, unit = known.contraction[m], bias.unit if bias.unit != "1" else ""
@@ -117,24 +113,21 @@ def judge_biases(
         elsewhere = f"{beyond}, by a misfit elsewhere: it explains {part:.1g} of the excess of the innovations"
         cases = (  # the first that holds counts
             (not status.explains, "conflicting", "the fit ended misfit: model and data contradict each other"),
-            (m in drifts, "drifting", drifts.get(m, "")),
+            *charged("drifting", m),
             (far and part >= PART, "conflicting", beyond),
-            (m in disagreements, "conflicting", disagreements.get(m, "")),
+            *charged("conflicting", m),
             (s < PRIOR_ONLY, "prior only", f"the data hardly narrow its {declared} ({information})"),
             (s < WEAK, "weak", f"the data narrow its {sizes} only ({information})"),
             (far, "weak", elsewhere),
-            (m in doubts, "weak", doubts.get(m, "")),
-            (m in shared, "weak", f"it belongs to {shared.get(m)}, which the data leave open"),
+            *charged("weak", m),
             (not status.settled, "weak", f"the fit ended {status}: its interval is not valid"),
             (ended[m] == "not mixed", "weak", "its chains have not mixed: its interval is not valid"),
             (ended[m] == "pruned", "weak", "pruned: its precision was maximised, so its interval is not valid"),
             (True, "determined", f"the data narrow its {sizes}"),
         )
         verdict, reason = next((verdict, reason) for holds, verdict, reason in cases if holds)
-        if verdict != "drifting" and known.square[m] > known.limit**2 and first not in ("", bias.label):
-            reason += f"; its halves differ by {np.sqrt(known.square[m]):.1f} sd, which {first} explains"
         verdicts.append(verdict)
-        sentences.append(reason)
+        sentences.append(reason + remarks.get(m, ""))
     return verdicts, sentences
 
 

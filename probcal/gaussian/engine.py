@@ -221,6 +221,14 @@ class Engine(Protocol):
         """The same at the modes of its trajectories for its biases."""
 
 
+def told_alone(at: Expansion) -> np.ndarray:
+    """Information (M,) of the rows about each bias, all other biases and the tracks known."""
+    found = np.zeros(at.model.biases + 1)
+    for *_, read, lin in at.model.each_block(at.model.read, at.rows):
+        np.add.at(found, read, np.einsum("nc,ncp->np", lin.weight, lin.bias**2))
+    return found[:-1]
+
+
 def evidence(at: Expansion, prior: Precision, factors: Factors | None = None) -> Estimate:
     """Log evidence at the mode under a Gaussian prior, trajectories and biases integrated by
     Laplace's formula.

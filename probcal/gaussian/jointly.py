@@ -28,28 +28,12 @@ class Variables(NamedTuple):
     z: Any  # (M, K)
 
 
-class Embedded(NamedTuple):
-    """The data about K further parameters at zero, the trajectories and biases eliminated."""
-
-    information: jax.Array  # (K, K)
-    score: jax.Array  # (K,)
-
-
 def covariance_times(at: Expansion, factors: Factors, slopes: Variables) -> Variables:
     """Joint posterior covariance of states and biases times slopes by them."""
     gains = tuple(kept.gain for kept in at.eliminated.parts)
     held, left = _held(at.model, at.rows, gains, tuple(at.held_states), slopes)
     dz = jnp.asarray(at.solve(factors, left))
     return Variables(_followed(at.model, at.rows, gains, held, dz), dz)
-
-
-def embedded(at: Expansion, factors: Factors, columns: Data) -> Embedded:
-    """Information and score of K more parameters, by which predicted values change as columns (N, C,
-    K)."""
-    found = covariance_times(at, factors, slopes_of(at.model, at.rows, columns))
-    moved = at.point.states, at.moved(jnp.zeros_like(at.point.z)).states
-    slope = jnp.asarray(at.slope() + factors.pull(at.point.z))
-    return _embedded(at.model, moved, at.rows, slope, columns, found)
 
 
 def times_weights(model: Model, rows: Rows, columns: Data) -> Data:
@@ -62,13 +46,6 @@ def follow_biases(model: Model, rows: Rows, gains: Gains, dz: jax.Array) -> tupl
     rows: no (E, n, M) is made."""
     pulls = model.onto_states(rows, times_weights(model, rows, model.by_bias(rows, -dz)))
     return model.each(lambda part, gain, b: rec.smooth(part.F, gain, b), gains, pulls)
-
-
-@jax.jit
-def slopes_of(model: Model, rows: Rows, columns: Data) -> Variables:
-    """Slopes by states and biases of what the data say along columns (N, C, K)."""
-    own = times_weights(model, rows, columns)
-    return Variables(tuple(model.onto_states(rows, own)), model.onto_biases(rows, own))
 
 
 @jax.jit
@@ -85,18 +62,3 @@ def _followed(
     model: Model, rows: Rows, gains: Gains, held: tuple[jax.Array, ...], dz: jax.Array
 ) -> tuple[jax.Array, ...]:
     return jax.tree.map(lambda own, by: own + by.states, held, follow_biases(model, rows, gains, dz))
-
-
-@jax.jit
-def _embedded(
-    model: Model, moved: tuple[Any, ...], rows: Rows, slope: jax.Array, columns: Data, found: Variables
-) -> Embedded:
-    """Columns less what states and biases make up for, and their score where the tracks have moved to their modes."""
-    left = jax.tree.map(jnp.subtract, tuple(columns), model.responses(rows, *found))
-    away = [(after - before)[:, :, None] for _, before, after in model.each_layout(*moved)]
-    information, score = jnp.zeros((found.z.shape[1],) * 2), -found.z.T @ slope
-    parts = model.each_block(rows, columns, times_weights(model, rows, left), model.by_state(rows, away))
-    for *_, lin, own, rest, by in parts:
-        information = information + jnp.einsum("nck,ncl->kl", own, rest)
-        score = score + jnp.einsum("nck,nc->k", own, lin.score - lin.weight * by[:, :, 0])
-    return Embedded(information, score)

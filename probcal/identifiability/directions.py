@@ -4,7 +4,7 @@ A direction is weak when its marginal information lambda is below 1 in units of 
 is the share of its answer that the data give. It is a gauge when no row fixes it (`identifiability.gauge`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from probcal.gaussian.engine import Expansion, Factors
 from probcal.gaussian.mode import Point
 from probcal.identifiability.gauge import Gauge, unfixed
-from probcal.identifiability.patterns import DILATION, Pattern, cause, common_shifts, rigid_motions
+from probcal.identifiability.patterns import DILATION, Pattern, cause, common_shifts, directed, rigid_motions
 from probcal.identifiability.remedies import TRIED, WEAK, Direction, with_remedies
 from probcal.identifiability.spaces import complete, inside, orthonormal, readable
 from probcal.identifiability.wording import amount, in_words, involved, name_without_owner, owner_of
@@ -183,19 +183,14 @@ def screened_directions(
     combination is one over its variance, less that of the prior; what moves along is what the data cannot tell from
     it. A remedy is kept where the information about the biases that it may fix says so, all others uncertain.
     """
-    scales = Factors.alone(np.ones(len(problem.labels)))
-    together = shared_directions(problem, at, scales)
+    together = shared_directions(problem, at)
     alone, count = alone_directions(problem, at.point, blocks, most)
     return (*together, *alone), len(together) + count
 
 
-def shared_directions(problem: Problem, at: Expansion, scales: Factors) -> tuple[Direction, ...]:
-    """Rigid motions and common shifts that the data leave to a prior of the declared scales, of these factors."""
-    patterns = list[tuple[Pattern, np.ndarray]]()
-    for pattern in (*rigid_motions(problem, np.asarray(at.point.z)), *common_shifts(problem)):
-        vector = np.where(problem.surveyed, 0.0, pattern.vector)
-        if np.count_nonzero(vector) > 1:
-            patterns.append((pattern, vector / np.linalg.norm(vector)))
+def shared_directions(problem: Problem, at: Expansion) -> tuple[Direction, ...]:
+    """Rigid motions and common shifts that the data leave to a prior of the declared scales."""
+    patterns, scales = list(directed(problem, np.asarray(at.point.z))), Factors.alone(np.ones(len(problem.labels)))
     if not patterns:
         return ()
     moved = np.asarray(at.solve(scales, np.stack([vector for _, vector in patterns], 1)))
@@ -208,11 +203,16 @@ def shared_directions(problem: Problem, at: Expansion, scales: Factors) -> tuple
             anchors.append(_strongest(problem, pattern.anchors, unit))
     if not found:
         return ()
-    own = unfixed(problem, at.point, np.stack([direction.vector for direction in found], 1))
-    found = [replace(d, kind="gauge" if free else d.kind) for d, free in zip(found, own, strict=True)]
+    found = with_kinds(problem, at.point, found)
     among = np.array(sorted({problem.labels.index(name) for groups in anchors for group in groups for name in group}))
     known = invert(np.asarray(at.marginals(scales, among[None]))[0]) - np.eye(len(among))
     return tuple(with_remedies(problem, known, among, found, anchors))
+
+
+def with_kinds(problem: Problem, point: Point, found: Sequence[Direction]) -> list[Direction]:
+    """The directions, each tried by itself whether it is a gauge."""
+    own = unfixed(problem, point, np.stack([direction.vector for direction in found], 1))
+    return [replace(d, kind="gauge" if free else d.kind) for d, free in zip(found, own, strict=True)]
 
 
 def _strongest(
@@ -255,27 +255,3 @@ def alone_directions(
         known = invert(blocks.covariance[b][np.ix_(free[b], free[b])]) - np.eye(len(own))
         done += with_remedies(problem, known, own, [one for one, _ in pairs], [p.anchors for _, p in pairs])
     return tuple(sorted(done, key=lambda direction: direction.information)), len(weak)
-
-
-def shared_in_blocks(
-    problem: Problem, point: Point, members: np.ndarray, covariance: np.ndarray, limit: float
-) -> dict[int, str]:
-    """The combination within a sensor that the data leave open and that would put a bias more than `limit` sd off.
-
-    By name. Where the truth lies c v along a combination v, its largest part one scale, an estimate under the declared
-    scales, of covariance C, is off by c C v.
-    """
-    free = np.append(~problem.surveyed, False)[members]
-    known = np.where(free[:, :, None] & free[:, None, :], covariance, 0.0)
-    values, vectors = spectrum(known)
-    sd = np.sqrt(np.maximum(np.diagonal(known, axis1=1, axis2=2), 1e-300))[:, :, None]
-    off = np.abs(known @ vectors) / sd / np.maximum(np.abs(vectors).max(1, keepdims=True), 1e-300)
-    information = 1.0 / np.maximum(values, 1e-300) - 1.0
-    off = np.where((information < WEAK)[:, None, :] & free[:, :, None], off, 0.0)
-    found, why = dict[int, str](), ""
-    for b, j in np.argwhere(off.max(2, initial=0.0) > limit):
-        why = why or cause(problem, point)
-        own, k = members[b][free[b]], int(off[b, j].argmax())
-        named = combination(problem, [problem.labels[m] for m in own], vectors[b, free[b], k], why)
-        found[int(members[b, j])] = f"{named.name} (information {max(information[b, k], 0.0):.2g})"
-    return found

@@ -17,6 +17,7 @@ from probcal.gaussian.mode import Point, compress
 from probcal.linalg import orthogonalise, spectrum
 from probcal.model import variants
 from probcal.model.model import Model
+from probcal.model.motions import by_component, linear_of
 from probcal.model.rows import Linearised
 from probcal.motion import Known, as_motion
 from probcal.problem import Problem
@@ -77,19 +78,13 @@ def held_states(problem: Problem) -> tuple[jax.Array, ...]:
     """Precision (E, n) of the states that are known beforehand: those of `Known` targets."""
     found = []
     for part, epochs in problem.model.each_layout(problem.epochs):
-        precision = np.zeros(part.drift.shape)
-        spread = np.asarray(jnp.sum(part.L**2, 2))
-        for name in dict.fromkeys(epochs.target):
-            mine = epochs.target == name
-            row = 0
-            linear, _ = as_motion(problem.target(str(name)).motion).split
-            for component in () if linear is None else linear.components:
-                d = problem.network.dimension
-                size = sum(d if per_axis else 1 for _, per_axis in component.names())
+        precision, spread = np.zeros(part.drift.shape), np.asarray(jnp.sum(part.L**2, 2))
+        for name, mine in epochs.members.items():
+            components = linear_of(as_motion(problem.target(name).motion))
+            for component, own, _ in by_component(components, problem.network.dimension):
                 if isinstance(component, Known):
-                    here = np.ix_(mine, np.arange(row, row + size))
+                    here = np.ix_(mine, np.arange(own.start, own.stop))
                     precision[here] = np.minimum(1 / np.maximum(spread[here], 1 / HELD), HELD)
-                row += size
         found.append(jnp.asarray(precision))
     return tuple(found)
 

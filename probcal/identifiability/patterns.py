@@ -1,6 +1,7 @@
 """Directions that a network is likely to leave open: common shifts, translation, rotation and dilation."""
 
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -47,25 +48,24 @@ def rigid_motions(problem: Problem, z: np.ndarray) -> list[Pattern]:
         (b.owner, b.axis): m for m, b in enumerate(problem.biases) if b.component == "position" and b.kind == "scale"
     }
     owners = {owner for owner, _ in place}
-    held = {
-        node.name: np.array([problem.fixed.get(f"{node.name}.position_{axis}", 0.0) for axis in AXES[:d]])
+    at = {
+        node.name: node.position + [problem.fixed.get(f"{node.name}.position_{axis}", 0.0) for axis in AXES[:d]]
         for node in problem.network.nodes
     }
-    anchors = [node.position + held[node.name] for node in problem.network.nodes if node.name not in owners]
+    anchors = [where for name, where in at.items() if name not in owners]
     if not owners or len(anchors) > 1:
         return []
-    shift = z * problem.scales
-    at = {node.name: node.position + held[node.name] for node in problem.network.nodes if node.name in owners}
+    at = {name: where for name, where in at.items() if name in owners}
     for (owner, axis), m in place.items():
-        at[owner][axis] += shift[m]
+        at[owner][axis] += z[m] * problem.scales[m]
     centre = anchors[0] if anchors else np.mean(list(at.values()), 0)
     about, who = (" about the anchor", "all nodes but the anchor") if anchors else ("", "all nodes")
 
-    def pattern(move: np.ndarray) -> np.ndarray:
-        """Velocities move @ (position - centre) of all free positions, in z."""
+    def pattern(move: np.ndarray, shift: Any = 0.0) -> np.ndarray:
+        """Velocities move @ (position - centre) + shift of all free positions, in z."""
         vector = np.zeros(len(z))
         for (owner, axis), m in place.items():
-            vector[m] = move[axis] @ (at[owner] - centre) / problem.scales[m]
+            vector[m] = (move @ (at[owner] - centre) + shift)[axis] / problem.scales[m]
         return vector
 
     nodes = tuple(
@@ -74,9 +74,7 @@ def rigid_motions(problem: Problem, z: np.ndarray) -> list[Pattern]:
     found = []
     if not anchors:
         for axis in range(d):
-            vector = np.zeros(len(z))
-            for (_, a), m in place.items():
-                vector[m] = (a == axis) / problem.scales[m]
+            vector = pattern(np.zeros((d, d)), np.eye(d)[axis])
             words = f"{who} move 1 m {TOWARDS[AXES[axis]]} together"
             name = f"translation of all nodes along {AXES[axis]}"
             found.append(Pattern(name, words, vector, "anchor the position of one node", nodes))
@@ -98,6 +96,14 @@ def rigid_motions(problem: Problem, z: np.ndarray) -> list[Pattern]:
     words = f"distances{about or ' from the centre'} grow together"
     found.append(Pattern(f"{DILATION}{about}", words, pattern(np.eye(d)), "anchor the positions of two nodes", nodes))
     return found
+
+
+def directed(problem: Problem, z: np.ndarray) -> Iterator[tuple[Pattern, np.ndarray]]:
+    """Rigid motions and common shifts of more than one bias without a survey, and the unit vector (M,) of each."""
+    for pattern in (*rigid_motions(problem, z), *common_shifts(problem)):
+        vector = np.where(problem.surveyed, 0.0, pattern.vector)
+        if np.count_nonzero(vector) > 1:
+            yield pattern, vector / np.linalg.norm(vector)
 
 
 def cause(problem: Problem, point: Point) -> str:

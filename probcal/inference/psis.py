@@ -9,19 +9,20 @@ ROWS = 2000  # smoothed at once
 PRIOR_DRAWS, PRIOR_K = 10, 0.5  # weight and place of the weak prior of the shape
 
 
-def smoothed(log_ratios: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def smoothed(log_ratios: np.ndarray, efficiency: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Normalised smoothed log weights (rows, draws) and Pareto k (rows,) of log importance ratios (rows, draws).
 
+    `efficiency` is the number of effective draws over that of all.
     k is infinite where the tail is no generalised Pareto distribution; rows whose ratios are all the same have k 0.
     """
-    parts = [_smoothed(log_ratios[start : start + ROWS]) for start in range(0, len(log_ratios), ROWS)]
+    parts = [_smoothed(log_ratios[start : start + ROWS], efficiency) for start in range(0, len(log_ratios), ROWS)]
     return np.concatenate([weights for weights, _ in parts]), np.concatenate([k for _, k in parts])
 
 
-def _smoothed(log_ratios: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _smoothed(log_ratios: np.ndarray, efficiency: float) -> tuple[np.ndarray, np.ndarray]:
     rows, draws = log_ratios.shape
     values = log_ratios - log_ratios.max(1, keepdims=True)
-    tail = min(int(3 * draws**0.5 if draws > 225 else draws / 5), draws - 1)
+    tail = min(int(3 * (draws / efficiency) ** 0.5 if draws * efficiency > 225 else draws / 5), draws - 1)
     if tail < 5:
         return values - _log_sum(values), np.full(rows, np.inf)
     order = np.argsort(values, axis=1)[:, draws - tail - 1 :]

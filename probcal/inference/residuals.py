@@ -345,15 +345,6 @@ def inflation(fit: Judged, wide: np.ndarray, group: np.ndarray) -> np.ndarray:
     return np.maximum(weighed[:M] / np.maximum(told[:M], 1e-300), np.mean(wide[group]))
 
 
-def told_alone(fit: Judged) -> np.ndarray:
-    """Information (M,) of the rows about each bias, all else known."""
-    told = np.zeros(fit.problem.model.biases + 1)
-    for *_, read, lin in fit.problem.model.each_block(fit.problem.model.read, fit.lins):
-        own = np.einsum("nc,ncp->np", np.asarray(lin.weight), np.asarray(lin.bias) ** 2)
-        told += np.bincount(read.ravel(), own.ravel(), len(told))
-    return told[:-1]
-
-
 def memory(value: np.ndarray, target: np.ndarray, time: np.ndarray) -> float:
     """Innovations of one channel that count as one: 1 + 2 sum of r_k over the first positive lag
     pairs.

@@ -27,7 +27,7 @@ from probcal.motion.base import level_name
 from probcal.priors import Precision
 from probcal.problem import Problem
 from probcal.results.blocks import SensorBlocks
-from probcal.results.groups import by_target, datum_of
+from probcal.results.groups import along, by_target, datum_of
 from probcal.results.read import Calibrated
 from probcal.status import INVALID
 from probcal.types import float64
@@ -290,7 +290,7 @@ def _widen_biases(result: xr.DataTree, group: xr.Dataset, wide: np.ndarray) -> N
     columns = {"sd": group["sd"].values * wide, **ends, "widened": wide}
     spread = SensorBlocks.read(group, group["bias_label"].values.tolist(), "widened").widened(wide)
     grown = spread.columns(np.ones(len(wide)))
-    group = group.assign({name: ("bias_label", values) for name, values in columns.items()})
+    group = group.assign(along("bias_label", columns))
     result["calibration"] = xr.DataTree(group.assign(grown))
     draws = result["posterior"].to_dataset()
     drawn = (draws["bias"] - draws["bias"].mean(("chain", "draw"))) * xr.DataArray(wide - 1.0, dims="bias_label")

@@ -20,6 +20,7 @@ from probcal.results.accessor import register
 from probcal.results.answer import Answer, Draws, Summary, Tracks
 from probcal.results.groups import (
     Band,
+    along,
     bias_coords,
     by_target,
     constant_group,
@@ -68,7 +69,7 @@ def build(answer: Answer, directions: Sequence[Any], key: jax.Array, keep: tuple
         coords = {"bias_label": list(problem.labels)} if steps else {}
         groups["optimisation"] = xr.Dataset({"objective": ("iteration", answer.trace), **steps}, coords=coords)
     if posterior.stats:
-        groups["sample_stats"] = xr.Dataset({k: (SAMPLE, v) for k, v in posterior.stats.items()}, coords=_sample(draws))
+        groups["sample_stats"] = xr.Dataset(along(SAMPLE, posterior.stats), coords=_sample(draws))
     if large and len(draws.log_likelihood):
         summed = sum(np.asarray(part).sum((2, 3)) for part in draws.log_likelihood)
         where = {"chain": np.arange(draws.z.shape[0]), "draw": draws.kept}
@@ -134,9 +135,9 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
         columns |= {"correlation": np.zeros(len(labels)), "correlated_with": np.array(labels, object)}
         for members, value in answer.prior.correlated(labels, problem.surveyed):
             columns["correlation"][members], columns["correlated_with"][members] = value, labels[members[0]]
-    values: dict[str, Any] = {name: ("bias_label", column) for name, column in columns.items()}
+    values = along("bias_label", columns)
     values |= found.covariance.columns(scales)
-    values |= {name: (("bias_label", "bias_label_other"), matrix) for name, matrix in matrices.items()}
+    values |= along(("bias_label", "bias_label_other"), matrices)
     coords = bias_coords(problem) | ({"bias_label_other": labels} if matrices else {})
     return xr.Dataset(values, coords=coords)
 
@@ -156,7 +157,7 @@ def _data_groups(answer: Answer, draws: Draws, before: Point, large: bool) -> di
     left = {name: gather([np.asarray(part) for part in own], picks) for name, own in parts.items()}
     if large:
         left |= {name: _stepped(left[name], left["std"], COARSE) for name in ("before", "after")}
-    residual = {name: ("datum", values) for name, values in left.items()}
+    residual = along("datum", left)
     groups = {
         "observed_data": xr.Dataset({"y": ("datum", datum["y"])}, coords=coords),
         "residual": xr.Dataset(residual, coords=coords),

@@ -40,7 +40,7 @@ def bias_coords(problem: Problem, chosen: Any = None) -> dict[str, Any]:
         biases = [biases[m] for m in (np.flatnonzero(index) if index.dtype == bool else index)]
     columns = {name: [getattr(b, name) for b in biases] for name in ("owner", "component", "sensor_type", "unit")}
     columns["axis"] = [AXES[b.axis] if b.vector else "" for b in biases]
-    found: dict[str, Any] = {name: ("bias_label", np.array(values, str)) for name, values in columns.items()}
+    found = along("bias_label", {name: np.array(values, str) for name, values in columns.items()})
     first = float(problem.measurements.time.min())
     since = np.array([first if b.since is None else b.since for b in biases], float)
     return {"bias_label": [b.label for b in biases], **found, "since": ("bias_label", since)}
@@ -73,12 +73,17 @@ def gather(parts: Sequence[np.ndarray], picks: list[tuple[np.ndarray, np.ndarray
     return np.concatenate(found, -1) if len(found) > 1 else found[0]
 
 
+def along(dim: Any, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Variables of one dimension, or several, by name."""
+    return {name: (dim, own) for name, own in values.items()}
+
+
 def direction_group(labels: Sequence[str], directions: Sequence[Any]) -> xr.Dataset:
     """Directions that the data do not fix: what moves, how weakly it is known, and the remedy."""
     names = ("sentence", "words", "kind", "remedy", "information", "share")
     columns = {name: [getattr(d, name) for d in directions] for name in names}
     columns["fix"] = [" ".join(d.fix) for d in directions]
-    group = xr.Dataset({name: ("direction", values) for name, values in columns.items()})
+    group = xr.Dataset(along("direction", columns))
     vectors = (("direction", "bias_label"), np.stack([d.vector for d in directions]))
     return group.assign(vector=vectors).assign_coords(direction=[d.name for d in directions], bias_label=list(labels))
 
