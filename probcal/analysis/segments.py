@@ -53,7 +53,7 @@ class Grid(NamedTuple):
 
     @property
     def columns(self) -> dict[str, np.ndarray]:
-        """The numbers of the differences, from 1 on, between the "halves" and between the "targets"."""
+        """The numbers of the differences, from 1 on, between "halves" and between "targets"."""
         parts = len(self.edges)
         every = {"halves": np.arange(1, parts), "targets": np.arange(parts, parts + self.groups - 1)}
         return {name: own for name, own in every.items() if len(own)}
@@ -161,7 +161,7 @@ def compare_segments(
 
 
 class _Differences:
-    """The expansion in which every bias may differ by q more: the M biases, then their differences."""
+    """The expansion in which every bias may differ by q more: M biases, then the differences."""
 
     def __init__(self, fit: Judged, grid: Grid):
         M, along = fit.problem.model.biases, grid.along
@@ -194,7 +194,7 @@ class _Differences:
         return inverse - np.asarray(own)[..., None] * np.eye(members.shape[1]), score
 
     def own_shift(self, name: str) -> list[jax.Array]:
-        """Shift of the biases (N, p) of each row where each member of a pattern has its own, of their scales."""
+        """Shift of the biases (N, p) of each row, each member of a pattern with its own."""
         M, columns = len(self.alpha), [0, *self.grid.columns[name]]
         copies = np.eye(len(columns))
         copies[:, 0] = 1.0  # each is the bias and its difference
