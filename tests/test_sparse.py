@@ -651,8 +651,8 @@ def weak_of_all(tree):
 def test_check_of_a_large_network_says_what_is_open(monkeypatch, capsys, tmp_path):
     """The command line with the sparse form: biases that the data tell least of, directions, status, files."""
     monkeypatch.setattr("probcal.gaussian.choose.prefers_sparse", lambda model: True)
-    monkeypatch.setattr("probcal.cli.check.MANY", 10)
-    monkeypatch.setattr("probcal.cli.check.SHOWN", 5)
+    monkeypatch.setattr("probcal.cli.files.MANY", 10)
+    monkeypatch.setattr("probcal.cli.files.SHOWN", 5)
     given = {"side": 3, "targets": 1, "epochs": 40}
     outputs = Outputs(tmp_path, ("check.nc", "check.csv", "check.png"))
     ended = check.run(Path(__file__).parents[1] / "models" / "large_network.py", None, (), given, None, outputs)

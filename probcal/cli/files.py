@@ -7,6 +7,9 @@ from pathlib import Path
 from probcal.files import Outputs, write_whole
 from probcal.lazy import pd, xr
 
+MANY = 400  # biases up to which all are printed
+SHOWN = 40  # biases that are printed of more
+
 
 def write_csv(frame: "pd.DataFrame", path: Path) -> None:
     """Write a table in one step."""
@@ -31,6 +34,11 @@ def formatted(frame: "pd.DataFrame", forms: Mapping[str, str]) -> "pd.DataFrame"
     """A table with the numbers of some columns as texts, those that it has."""
     texts = {name: frame[name].map(form.format) for name, form in forms.items() if name in frame}
     return frame.assign(**texts)
+
+
+def shortened(frame: "pd.DataFrame", order: "pd.Series") -> "pd.DataFrame":
+    """A table as it is; of more than `MANY` rows those that come first in an order, one number per row."""
+    return frame if len(frame) <= MANY else frame.loc[order.sort_values(kind="stable").index[:SHOWN]]
 
 
 def write_result(

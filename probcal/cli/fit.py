@@ -12,10 +12,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
-from probcal.cli.files import can_plot, formatted, report_of, say_findings, say_written, write_csv
+from probcal.cli.files import can_plot, formatted, report_of, say_findings, say_written, shortened, write_csv
 from probcal.cli.models import load_problem, load_truth, note_network, on_network, prior_named
 from probcal.cli.progress import shown
 from probcal.errors import InputError
@@ -34,7 +33,6 @@ from probcal.results.read import outliers, summary, with_calibration
 from probcal.status import INVALID, Status
 
 FINDINGS = 8  # sentences of an assessment that are printed
-MANY, SHOWN = 400, 40  # biases up to which all are printed, and of more so many
 FORMS = {  # of the columns of numbers in the table of biases
     **dict.fromkeys(("scale", "mean", "sd", "lower", "upper"), "{:.4g}"),
     **dict.fromkeys(("gamma", "inclusion", "r_hat"), "{:.3f}"),
@@ -167,12 +165,11 @@ def table_text(tree: xr.DataTree) -> str:
     """The table of biases as printed: label, unit, scale, mean, sd, interval, gamma, status, verdict."""
     frame = summary(tree)
     whole = len(frame)
-    if whole > MANY:
-        sure = (frame["mean"] / frame["sd"]).abs().to_numpy()
-        frame = frame.iloc[sorted(np.argsort(-sure, kind="stable")[:SHOWN])]
+    frame = shortened(frame, -(frame["mean"] / frame["sd"]).abs()).sort_index()
     columns = [name for name in ("bias", "unit", *FORMS, "status", "verdict") if name in frame]
     listed = formatted(frame[columns], FORMS).to_string(index=False, justify="right")
-    return listed if whole <= MANY else f"{listed}\n{SHOWN} of {whole} biases, those that are surest not to be zero"
+    left_out = f"\n{len(frame)} of {whole} biases, those that are surest not to be zero"
+    return listed + left_out * (len(frame) < whole)
 
 
 def _print_verdict(tree: xr.DataTree, seconds: float) -> None:

@@ -14,12 +14,12 @@ from matplotlib.patches import Ellipse
 
 from probcal.files import write_whole
 from probcal.plots.scene import ellipse
+from probcal.results.schema import INTERVAL
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d00", "#5d3a9b")
 BEFORE = "#a6a6a6"
 GAMMA = "viridis_r"  # light: prior only, dark: data only
 PALE, FAINT, SURE = "#e0e0e0", "#b5b5b5", "#c2185b"  # an object that hardly exists: on white, on any; one that does
-INTERVAL = 0.89  # probability of an interval where the tree does not say
 POINTS = 3_000  # of one track
 ALL_POINTS = 40_000  # of all tracks together
 ROWS = 120  # biases in one forest
