@@ -57,9 +57,17 @@ def mode_group(
     return xr.Dataset(values, coords={"mode": names, **coords}, attrs=attrs)
 
 
+def modes_in(tree: xr.DataTree) -> xr.Dataset:
+    """The group `mode`; of a tree that is no fit the reported answer without biases."""
+    if "mode" in tree.children:
+        return tree["mode"].to_dataset()
+    alone, none = ModeRow(REPORTED, REPORTED, np.zeros(0)), {"bias_label": np.zeros(0, str)}
+    return mode_group([alone], np.zeros(0), none, {"same": 0.0, "objective": ""})
+
+
 def rivals(tree: xr.DataTree) -> xr.Dataset:
     """The other answers that fit about as well as the reported one; `number` is their row."""
-    group = tree["mode"].to_dataset()
+    group = modes_in(tree)
     group = group.assign(number=("mode", np.arange(group.sizes["mode"])))
     return group.isel(mode=~np.isin(group["kind"].values, (REPORTED, AGAIN, REJECTED)))
 
@@ -72,7 +80,7 @@ def alike(tree: xr.DataTree) -> xr.Dataset:
 
 def started(tree: xr.DataTree) -> xr.Dataset | None:
     """The answers of several starts; `far` is the largest change of a bias there, in scales."""
-    group = tree["mode"].to_dataset()
+    group = modes_in(tree)
     from_start = group["start"].values >= 0
     if not from_start.any():
         return None
