@@ -12,7 +12,7 @@ import xarray as xr
 from probcal import plots
 from probcal.analysis import bound_map, next_anchors, next_passes, next_sensors, observability
 from probcal.analysis.standpoint import standpoint
-from probcal.cli.files import formatted, shortened, write_result
+from probcal.cli.files import formatted, printed_rows, write_result
 from probcal.cli.models import load_problem, on_network
 from probcal.cli.progress import shown
 from probcal.errors import InputError
@@ -109,7 +109,7 @@ def print_known(problem: Problem, tree: xr.DataTree) -> None:
     )
     for name in problem.silent:
         print(f'sensor "{name}" has no row: a fit refuses it; add rows or take it out of the network')
-    table = shortened(check_table(tree), _biases(tree)["share"])
+    table = printed_rows(check_table(tree), _biases(tree)["share"])
     print(table.to_string(index=False, justify="right"))
     if len(table) < tree["bias"].sizes["bias_label"]:
         print(f"{len(table)} of {tree['bias'].sizes['bias_label']} biases, those that the data tell least of")

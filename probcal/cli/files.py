@@ -36,7 +36,7 @@ def formatted(frame: "pd.DataFrame", forms: Mapping[str, str]) -> "pd.DataFrame"
     return frame.assign(**texts)
 
 
-def shortened(frame: "pd.DataFrame", order: "pd.Series") -> "pd.DataFrame":
+def printed_rows(frame: "pd.DataFrame", order: "pd.Series") -> "pd.DataFrame":
     """A table as it is; of more than `MANY` rows those that come first in an order, one number per row."""
     return frame if len(frame) <= MANY else frame.loc[order.sort_values(kind="stable").index[:SHOWN]]
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import xarray as xr
 
-from probcal.cli.files import can_plot, formatted, report_of, say_findings, say_written, shortened, write_csv
+from probcal.cli.files import can_plot, formatted, printed_rows, report_of, say_findings, say_written, write_csv
 from probcal.cli.models import load_problem, load_truth, note_network, on_network, prior_named
 from probcal.cli.progress import shown
 from probcal.errors import InputError
@@ -165,7 +165,7 @@ def table_text(tree: xr.DataTree) -> str:
     """The table of biases as printed: label, unit, scale, mean, sd, interval, gamma, status, verdict."""
     frame = summary(tree)
     whole = len(frame)
-    frame = shortened(frame, -(frame["mean"] / frame["sd"]).abs()).sort_index()
+    frame = printed_rows(frame, -(frame["mean"] / frame["sd"]).abs()).sort_index()
     columns = [name for name in ("bias", "unit", *FORMS, "status", "verdict") if name in frame]
     listed = formatted(frame[columns], FORMS).to_string(index=False, justify="right")
     left_out = f"\n{len(frame)} of {whole} biases, those that are surest not to be zero"
