@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from threading import Lock, get_ident
 from typing import Any, ClassVar
 from weakref import WeakSet
@@ -15,6 +17,7 @@ import numpy as np
 from probcal.gaussian.factor import Entries, Factor
 
 NO_ROOM = ("bad_alloc", "status -2", "status -3", "RESOURCE_EXHAUSTED")  # of XLA and of CHOLMOD
+THREADS = "OPENBLAS_NUM_THREADS"
 BESIDE = 8  # factors of each thread that are kept, where several threads have one
 
 
@@ -34,9 +37,8 @@ class Cholmod(Factor):
     _counting: ClassVar[Lock] = Lock()
 
     def __init__(self, places: Entries, values: np.ndarray):
-        import sparsax  # an extra
-
-        self._library, self.places, self._thread = sparsax, places, get_ident()
+        self._library, self._thread = _imported(), get_ident()
+        self.places, self.values = places, values
         with _calling():
             self._entries = tuple(jnp.asarray(part) for part in (places.row, places.column, values))
         with self._counting:
@@ -77,15 +79,31 @@ class Cholmod(Factor):
         """Log determinant, and no error."""
         return float(self._asked(lambda token: float(self._library.logdet_factor(token)))), 0.0
 
-    def selected(self) -> np.ndarray:
-        """The inverse at the place of each entry."""
-        with _calling():
-            return np.asarray(self._library.selinv(*self._entries, self.places.size))
+    @property
+    def order(self) -> np.ndarray:
+        """Place (n,) of each variable in the order of elimination."""
+        return np.argsort(self._apply(np.arange(float(self.places.size)), self._library.MODE_P))
 
     def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Draws (count, n) around zero with this precision."""
         normal = rng.standard_normal((self.places.size, count))
         return self._apply(normal, self._library.MODE_LT, self._library.MODE_PT).T
+
+
+@cache
+def _imported() -> Any:
+    """The library, its BLAS on one thread unless the environment says otherwise.
+
+    The dense parts of a factor are small: of 2,500 radars two threads of OpenBLAS, which wait for
+    each other, take ten times the processor's time of one.
+    """
+    said = os.environ.get(THREADS)
+    os.environ.setdefault(THREADS, "1")  # read when the library is loaded
+    import sparsax  # an extra
+
+    if said is None:
+        del os.environ[THREADS]
+    return sparsax
 
 
 @contextmanager

@@ -11,8 +11,11 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from probcal.gaussian.selected import Fronts
+
 FULL = 16  # places of a matrix per entry up to which solves of all columns are faster
 COLUMNS = 256  # solved at once
+_FRONTS: list[tuple[np.ndarray, Fronts]] = []  # of the last two patterns, by their rows
 
 
 class Entries(NamedTuple):
@@ -29,6 +32,12 @@ class Factor(ABC):
     """A factorised matrix (n, n); everything is NumPy."""
 
     places: Entries
+    values: np.ndarray  # (entries,)
+
+    @property
+    @abstractmethod
+    def order(self) -> np.ndarray:
+        """Place (n,) of each variable in the order of elimination."""
 
     @abstractmethod
     def solve(self, right: np.ndarray) -> np.ndarray:
@@ -48,9 +57,15 @@ class Factor(ABC):
         whole = np.concatenate([self.solve(np.eye(size, COLUMNS, -start)) for start in starts], 1)
         return 0.5 * (whole[row, column] + whole[column, row])
 
-    @abstractmethod
     def selected(self) -> np.ndarray:
         """The same by Takahashi's equations, of a matrix that is not full."""
+        row, column, size, *_ = self.places
+        fronts = next((own for known, own in _FRONTS if known is row), None)
+        if fronts is None:
+            at = self.order[np.stack([row, column])]
+            fronts = Fronts.of(at.max(0), at.min(0), size)
+            _FRONTS[:] = [(row, fronts), *_FRONTS[:1]]
+        return fronts.inverse(self.values)
 
     def inverse_diagonal(self) -> tuple[np.ndarray, np.ndarray]:
         """Diagonal (n,) of the inverse, and its standard error (n,), 0 where it is exact."""

@@ -146,9 +146,10 @@ class Products(Factor):
         """There is none: raises `InputError`."""
         raise InputError(LACKS)
 
-    def selected(self) -> np.ndarray:
-        """The same."""
-        return self.inverse
+    @property
+    def order(self) -> np.ndarray:
+        """There is none either."""
+        raise InputError(LACKS)
 
     def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Draws (count, n) around zero with this precision (Chow, Saad 2014)."""
