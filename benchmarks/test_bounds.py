@@ -14,9 +14,10 @@ import pytest
 
 from probcal import Truth
 from probcal.analysis.bounds import bounds
-from probcal.analysis.maps import bound_map, snapshot, spectra
+from probcal.analysis.maps import BiasBlocks, bound_map, snapshot, spectra
 from probcal.analysis.sensitivity import sensitivity
 from probcal.gaussian.mode import Point
+from probcal.results.blocks import SensorBlocks
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import radars
@@ -43,10 +44,11 @@ def test_a_map_of_100_x_100_cells(benchmark, biases):
     places = np.random.default_rng(0).uniform(0, radars.AREA, (1 + SAMPLE, 1, 2))
     with jax.enable_x64(True):
         point = Point((), (), jnp.zeros(M), jnp.zeros(0))
-        root = None if biases == "unknown" else jnp.zeros((0, 0))
+        alone = SensorBlocks(M, np.arange(M)[:, None], np.ones((M, 1, 1)))
+        blocks = BiasBlocks.of(at.model, alone) if biases == "unknown" else None
 
         def cell(place):
-            return spectra(at.model, (0, 2), point, root, jnp.asarray(place)).block_until_ready()
+            return spectra(at.model, (0, 2), point, blocks, jnp.asarray(place)).block_until_ready()
 
         cell(places[0])  # compiles
         began = time.perf_counter()

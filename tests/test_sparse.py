@@ -539,6 +539,9 @@ def test_a_dense_form_that_fits_no_machine_is_refused(monkeypatch):
     monkeypatch.setattr("probcal.gaussian.room.ROOM", 100)
     with pytest.raises(InputError, match=r"the dense form of 15 biases and .* states takes .* GB"):
         check_room(drawn()[0].model)
+    monkeypatch.setattr("probcal.gaussian.choose.ROOM", 0)
+    with pytest.raises(InputError, match="log_evidence on a network of this size takes precisions and noise levels"):
+        pc.log_evidence(drawn()[0])
     with jax.enable_x64(True), pytest.raises(InputError, match="in sparse form"):
         compress(drawn()[0].model, linearise_rows(drawn()[0].model, automatic_start(drawn()[0])))
 

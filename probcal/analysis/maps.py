@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +12,12 @@ import xarray as xr
 
 from probcal import linalg
 from probcal.errors import InputError, nearest
-from probcal.gaussian.mode import compress, factors
-from probcal.gaussian.room import check_room
+from probcal.gaussian.mode import factors
 from probcal.labels import AXES, NOBODY
 from probcal.linalg import root_of
-from probcal.model.model import At, Model
+from probcal.model.model import At, Data, Model
 from probcal.problem import Problem, check_linear
+from probcal.results.blocks import SensorBlocks
 from probcal.results.read import apply
 from probcal.simulate import blank
 from probcal.types import float64
@@ -41,8 +41,10 @@ def bound_map(
 
     The position is free; every further state component has its start as prior (its mean is where it is evaluated).
     `biases` are `"known"` (the stated values), `"unknown"` (marginalised with one scale or their survey) or a fit:
-    its means with its covariance. `cells` along x and y, `z` the height in m of a 3-D map, `target` whose motion is
-    taken (the first), `time` at which moving nodes are met (the first). Of the table no more than that is used.
+    its means with its covariance, of a large fit that of each sensor alone, as if sensors were
+    independent. `cells` along x and y, `z` the height in m of a 3-D map, `target` whose motion is
+    taken (the first), `time` at which moving nodes are met (the first). Of the table no more than
+    that is used.
 
     Variables over (y, x): `rmse` = sqrt tr J^-1 in m (thesis 4.4.2, RSS paper 22-23), `trace` and `smallest` eigenvalue
     of the information J in 1/m^2 (RSS paper 20-21), `determined`. A bound beyond the diagonal of the area is no
@@ -59,24 +61,23 @@ def bound_map(
     at = snapshot(problem, target, time)
     M = len(at.labels)
     mean, levels = np.zeros(M), np.zeros(len(at.levels))
-    root: np.ndarray | None = np.zeros((0, 0))
+    spread: SensorBlocks | None = None
     if isinstance(biases, xr.DataTree):
         if not {"calibration", "constant_data"} <= set(biases.children):
             raise InputError("bound_map: the tree of biases has no group calibration; give the result of fit()")
         found = apply(at, biases)
         at, mean, levels = found.problem, found.z, found.levels
-        root = root_of(found.covariance)
+        spread = found.spread
     elif biases == "unknown":
-        root = None
+        spread = SensorBlocks(M, np.arange(M)[:, None], np.ones((M, 1, 1)))
     elif biases != "known":
         raise InputError(f'bound_map: biases is {biases!r}; give "known", "unknown" or the result of fit()')
-    if root is None or len(root):
-        check_room(at.model)
     flat = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     places = flat if z is None else np.column_stack([flat, np.full(len(flat), float(z))])
     span = at.epochs[0].position
     point = At((), jnp.asarray(mean), jnp.asarray(levels))
-    values = np.asarray(spectra(at.model, span, point, root, jnp.asarray(places)))
+    blocks = None if spread is None else BiasBlocks.of(at.model, spread)
+    values = np.asarray(spectra(at.model, span, point, blocks, jnp.asarray(places)))
     with np.errstate(divide="ignore"):
         rmse = np.sqrt((1.0 / values).sum(1))
     largest = float(np.hypot(*np.ptp(np.asarray(area, float), axis=1)))
@@ -133,32 +134,71 @@ def snapshot(problem: Problem, target: str | None = None, time: float | None = N
     return found
 
 
+class BiasBlocks(NamedTuple):
+    """The biases in blocks of which no row and no covariance couples two."""
+
+    root: np.ndarray  # (B, p, p) of the covariance of each
+    block: Data  # (N,) that each row reads
+    place: Data  # (N, q) of each bias that it reads in there, p of none
+
+    @classmethod
+    def of(cls, model: Model, spread: SensorBlocks) -> "BiasBlocks":
+        """The blocks of a model whose biases have a covariance."""
+        M, reads = model.biases, [np.asarray(own) for own in model.read]
+        least, before = np.arange(M + 1), np.zeros(0, int)
+        while not np.array_equal(least, before):
+            before = least.copy()
+            for own in (*reads, spread.members):
+                np.minimum.at(least, own, least[own].min(1, initial=M)[:, None])
+                least[M] = M
+        numbers, block = np.unique(least[:M], return_inverse=True)
+        order, sizes = np.argsort(block, kind="stable"), np.bincount(block, minlength=len(numbers))
+        place = np.zeros(M, int)
+        place[order] = np.arange(M) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+        p = int(sizes.max(initial=0))
+        block, place = np.append(block, 0), np.append(place, p)
+        covariance, at = np.zeros((len(numbers), p + 1, p + 1)), place[spread.members]
+        number = block[spread.members].max(1, initial=0)[:, None, None]
+        covariance[number, at[:, :, None], at[:, None, :]] = spread.covariance
+        return cls(
+            root_of(covariance[:, :p, :p]),
+            tuple(block[own].max(1, initial=0) for own in reads),
+            tuple(place[own] for own in reads),
+        )
+
+
 @partial(jax.jit, static_argnames="span")
-def spectra(model: Model, span: tuple[int, int], point: At, root: Any, places: jax.Array) -> jax.Array:
+def spectra(model: Model, span: tuple[int, int], point: At, biases: BiasBlocks | None, places: jax.Array) -> jax.Array:
     """Eigenvalues (cells, d) of the information about the position at places (cells, d).
 
-    The biases have covariance root root' (M, M), the identity if None; without columns, (0, 0), they are known.
+    The biases are known if None.
 
     What else is unknown is v = V e with e of unit covariance: A - C V (I + V'BV)^-1 V'C', with A, C and B the
-    information of the position, with v and of v. No covariance is inverted, so that any of them may be singular.
+    information of the position, with v and of v; the biases first, block by block. No covariance is
+    inverted, so that any of them may be singular.
     """
     part, place = model.recursions[0], slice(*span)
     own = factors(part, point.levels)[0].at[place].set(0.0)
-    joint = root is None or root.shape[1] > 0
 
     def cell(position: jax.Array) -> jax.Array:
         states = (part.drift.at[0, place].set(position),)
         lins = model.linearise(point._replace(states=states), expected=True)
-        rows = compress(model, lins, joint=joint)
-        J, G, cross = rows.states[0][0][0], rows.information, rows.crosses[0][0]
-        if root is not None:
-            G, cross = root.T @ G @ root, cross @ root
-        inner = jnp.block([[own.T @ J @ own, own.T @ cross], [cross.T @ own, G]])
-        half = linalg.factor_and_inverse(inner + jnp.eye(inner.shape[0]))[1]
-        half = half @ jnp.concatenate([J[place] @ own, cross[place]], 1).T
+        J = known = model.of_states(lins)[0][0][0]
+        if biases is not None:
+            B, p, _ = biases.root.shape
+            G, cross = jnp.zeros((B, p + 1, p + 1)), jnp.zeros((B, len(J), p + 1))
+            for block, _, _, lin, b, at in model.each_block(lins, biases.block, biases.place):
+                weighed, used = lin.weight[:, :, None] * lin.bias, np.asarray(block.used, int)
+                b, at = b[:, None, None], at[:, None, :]
+                G = G.at[b, at.mT, at].add(lin.bias.mT @ weighed)
+                cross = cross.at[b, used[:, None], at].add(lin.state.mT @ weighed)
+            G = biases.root.mT @ G[:, :p, :p] @ biases.root + jnp.eye(p)[None]
+            half = jax.vmap(linalg.factor_and_inverse)(G)[1] @ (cross[:, :, :p] @ biases.root).mT
+            J = J - jnp.einsum("bpn,bpm->nm", half, half)
+        half = linalg.factor_and_inverse(own.T @ J @ own + jnp.eye(len(J)))[1] @ (J[place] @ own).T
         left = J[place, place] - half.T @ half
         values, _ = linalg.spectrum(0.5 * (left + left.T))
-        return jnp.where(values > LOST * jnp.trace(J[place, place]), values, 0.0)
+        return jnp.where(values > LOST * jnp.trace(known[place, place]), values, 0.0)
 
-    width = own.shape[1] + (model.biases if joint else 0)
-    return jax.lax.map(cell, places, batch_size=max(1, min(BATCH[0], BATCH[1] // width**2)))
+    size = len(own) ** 2 if biases is None else len(own) ** 2 + biases.root.size
+    return jax.lax.map(cell, places, batch_size=max(1, min(BATCH[0], BATCH[1] // size)))

@@ -18,7 +18,6 @@ def check_room(model: Model) -> None:
         size = 8e-9 * dense_numbers(model)
         raise InputError(
             f"the dense form of {model.biases} biases and {model.state_size} states takes {size:.0f} GB: EA(), MAP()"
-            " and Gibbs() fit a network of this size in sparse form, and track, assess, compare, observability, bounds,"
-            " sensitivity, next_passes, next_anchors and next_sensors take it; for all else take fewer sensors or a"
-            " shorter time"
+            " and Gibbs() fit a network of this size in sparse form, and the verbs take it; for other methods take"
+            " fewer sensors or a shorter time"
         )

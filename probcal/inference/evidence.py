@@ -9,17 +9,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.errors import InputError
+from probcal.errors import FitError, InputError
+from probcal.gaussian.choose import choose
 from probcal.gaussian.mode import Point
-from probcal.gaussian.room import check_room
 from probcal.inference.gibbs import gibbs_sweep
 from probcal.inference.hierarchy import Phi
-from probcal.inference.methods import check_problem
+from probcal.inference.method import Context
+from probcal.inference.methods import MAP, check_problem
 from probcal.inference.pose import pareto_khat, pose, weights
 from probcal.inference.posed import Form, Posed, conditional, draw_given, prior_precision
 from probcal.inference.psis import smoothed
+from probcal.inference.solve import solve
 from probcal.modes import automatic_start
-from probcal.priors import AnyPrior, Flat, Horseshoe, as_prior
+from probcal.priors import AnyPrior, Flat, Horseshoe, Prior, as_prior
 from probcal.problem import Problem
 from probcal.simulate import Key, as_key
 from probcal.types import float64
@@ -32,7 +34,10 @@ SHORTEST = 1e-30  # step that is taken whatever it leaves
 
 
 class Evidence(NamedTuple):
-    """Log evidence in nats, its Monte Carlo standard error, and the Pareto k-hat of its correction."""
+    """Log evidence in nats, its standard error, and the Pareto k-hat of its correction.
+
+    The k-hat is NaN where nothing is corrected.
+    """
 
     value: float
     error: float
@@ -47,18 +52,21 @@ def log_evidence(problem: Problem, *, prior: AnyPrior = None, key: Key = 0, star
     form; the latter are integrated by sequential Monte Carlo from their prior to their posterior (Del Moral, Doucet,
     Jasra 2006). Importance weights correct what the frame leaves out: where `khat` is above 0.7 they, and the error,
     are not to be trusted. Under a `Gaussian` prior a linear-Gaussian problem has its evidence to rounding.
-    Raises `InputError` for a flat prior, which has no evidence, and for process noise that is not Gaussian.
+    A large network has that of Laplace's formula at the mode, under a `Gaussian` prior.
+    Raises `InputError` for a flat prior, which has no evidence, for process noise that is not
+    Gaussian, and for a large network with another prior or with noise levels that are unknown.
     """
     chosen = as_prior(prior, Horseshoe(), problem.network.labels)
     if isinstance(chosen, Flat):
         raise InputError("log_evidence: a flat prior has no evidence; give a proper one")
     check_problem(problem)
-    check_room(problem.model)
     if problem.model.tailed:
         raise InputError(
             "log_evidence: the frame is no match for process noise that is not Gaussian; compare the"
             " log predictive densities of two fits, as `probcal compare` does"
         )
+    if not choose(problem.model).cheap:
+        return _at_mode(problem, chosen, key, start)
     keys = jax.random.split(as_key(key), 3)
     point = automatic_start(problem) if start is None else start
     form, posed, _, _ = pose(problem, chosen, point, keys[0], whole=True)
@@ -70,6 +78,21 @@ def log_evidence(problem: Problem, *, prior: AnyPrior = None, key: Key = 0, star
         corrections = smooth + (corrections - smooth)[corrections.argmin()]  # smoothing leaves the small weights alone
     value, spread = combined(runs.evidence + _log_mean(corrections.reshape(RUNS, PARTICLES)))
     return Evidence(value, max(spread, runs.error), khat)
+
+
+def _at_mode(problem: Problem, prior: Prior, key: Key, start: Point | None) -> Evidence:
+    """The evidence under a Gaussian prior by Laplace's formula at the mode, on an engine."""
+    method = MAP()
+    if not method.takes(prior) or prior.learns or problem.levels:
+        raise InputError(
+            "log_evidence on a network of this size takes precisions and noise levels that are given:"
+            " Gaussian(), and a std for every noise"
+        )
+    answer = solve(problem, method, prior, Context(as_key(key)), start=start)
+    if not answer.status.valid:
+        raise FitError(answer.message)
+    error = answer.posterior.attrs.get("log_evidence_error", 0.0)
+    return Evidence(answer.objective, float(error), float("nan"))
 
 
 def combined(logs: np.ndarray) -> tuple[float, float]:
