@@ -13,7 +13,7 @@ import numpy as np
 
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.engine import Estimate, Factors, Sampled, Spread, density_of
-from probcal.gaussian.factor import Factor, Library
+from probcal.gaussian.factor import COLUMNS, Factor, Library
 from probcal.gaussian.held import hold, inform
 from probcal.gaussian.joint import JointPrecision
 from probcal.gaussian.jointly import times_weights
@@ -23,7 +23,6 @@ from probcal.gaussian.mode import SETTLED, TRACK_STEPS, Eliminated, Point, facto
 from probcal.model.model import Data, Model, scaled
 from probcal.model.rows import Linearised
 
-COLUMNS = 256  # of a root of the covariance at once
 WHOLE = 600  # biases up to which a matrix of all is made on request (its eigenvalues take 0.2 s)
 
 
