@@ -11,8 +11,10 @@ from scipy import stats
 import probcal
 from probcal import ARD, EA, MAP, ConstantVelocity, Gaussian, Network, Node, Problem, simulate
 from probcal.inference.pruned import GroupEvidence, without_far_modes
-from probcal.modes import automatic_start, mirrors
-from probcal.modes.crossings import _parted, node_sides
+from probcal.labels import NODE
+from probcal.modes import automatic_start
+from probcal.modes.crossings import _parted, nodes
+from probcal.modes.explore import TRIED, Candidate, SideClimb, Sides, explore
 from probcal.modes.grid import track_mode
 from probcal.modes.reflections import Plane, across
 from probcal.plots.interactive import interactive_map, layers
@@ -109,7 +111,7 @@ def test_a_height_alone_is_free():
     assert abs(mean + 56.0) < 4 * sd < 20.0
 
 
-def test_climbs_that_come_back_are_few(monkeypatch):
+def test_climbs_that_come_back_are_few():
     """Of a hundred nodes that come back eight are climbed."""
     problem = beside(0, 4.0, **{"b0.position_y": -20.0})
     with jax.enable_x64(True):
@@ -119,9 +121,9 @@ def test_climbs_that_come_back_are_few(monkeypatch):
             climbs.append(at)
             return point, 0.0
 
-        monkeypatch.setattr(mirrors, "node_sides", lambda *_: ((f"n{k}", point) for k in range(100)))
-        assert mirrors._crossed(problem, point, mirrors.SideClimb(mode, lambda *_: 0.0)) == (point, "", [])
-        assert len(climbs) == 1 + mirrors.TRIED
+        many = (lambda *_: (Candidate(f"n{k}", NODE, point) for k in range(100)),)
+        assert explore(problem, point, SideClimb(mode, lambda *_: 0.0), many) == Sides(point, False, ())
+        assert len(climbs) == 1 + TRIED
 
 
 @pytest.mark.slow
@@ -130,7 +132,7 @@ def test_nodes_cross_together():
     with jax.enable_x64(True):
         shifts = {f"b{k}.position_y": -2.0 * PLACES[k][1] for k in (0, 1, 2)}
         three = beside(0, 4.0, ("b0", "b1", "b2"), scale=10.0, **shifts)
-        first, _ = next(node_sides(three, automatic_start(three), 0.4))
+        first = next(nodes(three, automatic_start(three))).name
     assert first.endswith("nodes elsewhere beside the paths that they hear")
     tree = probcal.fit(three, MAP(), prior=Gaussian())
     for label, shift in shifts.items():
@@ -205,7 +207,7 @@ def test_a_node_surveyed_on_its_side_costs_no_look():
     """Its scale is 1 m, the other side 20 m away."""
     problem = beside(0, 0.0, scale=1.0)
     with jax.enable_x64(True), patch("probcal.modes.crossings._linearised") as looked:
-        assert not list(node_sides(problem, automatic_start(problem), 0.4))
+        assert not list(nodes(problem, automatic_start(problem)))
     assert not looked.called
 
 

@@ -19,8 +19,9 @@ from probcal.gaussian.mode import factors
 from probcal.inference import calibrate, solve
 from probcal.inference.progress import Monitor
 from probcal.modes import automatic_start
+from probcal.modes.explore import Mirrored, Sides
 from probcal.modes.grid import track_mode
-from probcal.modes.mirrors import Mirrored, Sides, other_sides
+from probcal.modes.mirrors import other_sides
 from probcal.modes.reflections import planes, reflect, reflect_nodes
 from probcal.plots.map import plot_map
 from probcal.results.answer import Answer

@@ -13,7 +13,7 @@ import probcal as pc
 from probcal.errors import FitError, InputError
 from probcal.inference import calibrate
 from probcal.inference.progress import Monitor, Stopped, duration
-from probcal.modes.mirrors import Sides
+from probcal.modes.explore import Sides
 
 
 class Clock:

@@ -25,7 +25,7 @@ from probcal.inference.method import Context
 from probcal.inference.mixture import gaussian, mixture
 from probcal.inference.placed import Reached, with_places
 from probcal.model.model import Mixing, Model
-from probcal.modes.mirrors import CLIMB
+from probcal.modes.explore import CLIMB
 from probcal.priors import Flat, Gaussian, Precision, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, Posterior, blocks_under, tracks_at

@@ -16,7 +16,7 @@ from probcal.identifiability.watch import runs, strained_starts
 from probcal.inference.progress import Monitor
 from probcal.inference.widen import judge_fit
 from probcal.labels import NODE, START, listed
-from probcal.modes.mirrors import SAME, Mirrored
+from probcal.modes.explore import SAME, Mirrored
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.results.build import build

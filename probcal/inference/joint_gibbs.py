@@ -38,7 +38,7 @@ from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
 from probcal.inference.split_hmc import Reference, SplitGaussian, placed, split_variables, variables_of
 from probcal.model.model import Model
-from probcal.modes.mirrors import CLIMB
+from probcal.modes.explore import CLIMB
 from probcal.priors import Horseshoe, Precision, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, Posterior, Tracks, blocks_under

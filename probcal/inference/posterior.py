@@ -20,8 +20,8 @@ from probcal.inference.pose import pareto_khat
 from probcal.inference.posed import Posed
 from probcal.inference.sampling import SamplerRun
 from probcal.model.motions import level_values
+from probcal.modes.explore import Mirrored
 from probcal.modes.grid import track_mode
-from probcal.modes.mirrors import Mirrored
 from probcal.priors import Flat, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, Draws, Posterior, Summary, Tracks

@@ -24,8 +24,8 @@ from probcal.inference.progress import Monitor
 from probcal.inference.sampler import Sampler
 from probcal.inference.sides import Sided, distances, side_by_side
 from probcal.inference.storage import Chunks, Storage
-from probcal.modes.mirrors import Mirrored, other_sides
-from probcal.modes.reflections import new, reach
+from probcal.modes.explore import Mirrored, new, reach
+from probcal.modes.mirrors import other_sides
 from probcal.priors import Prior
 from probcal.problem import Problem
 

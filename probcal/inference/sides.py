@@ -15,8 +15,8 @@ from probcal.gaussian.information import at_levels
 from probcal.gaussian.mode import Point, mixed_density
 from probcal.inference.leaps import Place
 from probcal.inference.posed import Form, Posed, log_prior
+from probcal.modes.explore import new, reach
 from probcal.modes.grid import track_mode
-from probcal.modes.reflections import new, reach
 from probcal.problem import Problem
 
 

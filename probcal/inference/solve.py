@@ -20,9 +20,9 @@ from probcal.labels import SCENE, START, listed
 from probcal.modes import further_starts
 from probcal.modes import optima as optima_of
 from probcal.modes.clocks import first_times, settled_times, taken_there
+from probcal.modes.explore import MORE, NEAR, SAME, Mirrored, SideClimb, Sides, new, reach
 from probcal.modes.grid import follow_states, grid_start
-from probcal.modes.mirrors import MORE, NEAR, SAME, Mirrored, SideClimb, Sides, other_sides
-from probcal.modes.reflections import new, reach
+from probcal.modes.mirrors import other_sides
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer

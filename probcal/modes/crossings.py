@@ -12,9 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian.mode import Point
+from probcal.labels import NODE
 from probcal.linalg import solve_square, spectrum
 from probcal.model.model import At, Model
 from probcal.model.rows import Linearised
+from probcal.modes.explore import WORSE, Candidate
 from probcal.modes.reflections import FAR, SHIFTED, Plane, node_places, place_biases
 from probcal.problem import Problem
 
@@ -27,11 +29,11 @@ NEAR = 2.0  # scales from its path within which a node may have settled on neith
 ASIDE = 5.0  # sd from where it settles on its own side at which it stands on another: below, it came back
 
 
-def node_sides(problem: Problem, point: Point, worse: float, most: float = np.inf) -> Iterator[tuple[str, Point]]:
-    """Each node on the other side of its path, tracks as they are: names and points, those first that fit best.
+def nodes(problem: Problem, point: Point, most: float = np.inf) -> Iterator[Candidate]:
+    """Each node on the other side of its path, tracks as they are, those first that fit best.
 
     Only where its free axes let it, within the reach of its scales. Its biases, and those of its sensors, settle there;
-    what then fits more than `worse` nats a datum worse, or more than `most` nats, is left out. A node within `NEAR`
+    what then fits more than `WORSE` nats a datum worse, or more than `most` nats, is left out. A node within `NEAR`
     scales of its path may have settled on neither side, and begins at so many on both too.
     """
     z, members, place = np.asarray(point.z), place_biases(problem), node_places(problem, np.asarray(point.z))
@@ -68,15 +70,16 @@ def node_sides(problem: Problem, point: Point, worse: float, most: float = np.in
         whole = z.copy()
         for k in most_of:
             whole[own.of_node(k)] = settled[k]
-        yield f"{len(most_of)} nodes elsewhere beside the paths that they hear", point._replace(z=jnp.asarray(whole))
+        name = f"{len(most_of)} nodes elsewhere beside the paths that they hear"
+        yield Candidate(name, NODE, point._replace(z=jnp.asarray(whole)))
     for k in sorted(settled, key=lambda k: drop[k]):
-        if drop[k] < min(worse * own.count[k], most):
+        if drop[k] < min(WORSE * own.count[k], most):
             other = z.copy()
             other[own.of_node(k)] = settled[k]
             now = node_places(problem, other)[names[k]]
             crossed = paths[k].distance(now) * paths[k].distance(place[names[k]]) < 0
             where = "on the other side of the path" if crossed else "elsewhere beside the path"
-            yield f'node "{names[k]}" {where} that it hears', point._replace(z=jnp.asarray(other))
+            yield Candidate(f'node "{names[k]}" {where} that it hears', NODE, point._replace(z=jnp.asarray(other)))
 
 
 def _starts(

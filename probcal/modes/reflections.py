@@ -1,9 +1,8 @@
-"""Lines and planes of a network, what is reflected in them, and how far one answer lies from another."""
+"""Lines and planes of a network, and what is reflected in them."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,9 +14,7 @@ from probcal.modes.grid import follow_states, known_places
 from probcal.problem import Problem
 
 FAR = 6.0  # scales beyond which a node is not reflected
-FAINT = 0.03  # share of the extent of the tracks, of which a part (`new`) is no other place
 SHIFTED = 0.3  # scales by which nodes must be moved to count as reflected
-APART = 0.1  # share of a reflection that must be left after polishing: below, it came back
 WINDOWS, HEARD = 60, 4  # parts of a track in which nodes may be heard alone, and sets of such nodes that are looked at
 
 
@@ -170,37 +167,3 @@ def movable(problem: Problem) -> list[np.ndarray]:
         _, known = known_places(problem, r, epochs.position)
         found.append(~known)
     return found
-
-
-class Gap(NamedTuple):
-    """What lies between two points: root sums of squares, over all places of targets and over those of nodes."""
-
-    tracks: float  # m
-    nodes: float  # in declared scales
-
-
-def distance(problem: Problem, a: Point, b: Point) -> Gap:
-    """What lies between the places of two points."""
-    away = problem.positions(jax.tree.map(np.subtract, a.states, b.states))
-    own = [m for members in place_biases(problem).values() for m in members]
-    moved = (np.asarray(a.z) - np.asarray(b.z))[own]
-    return Gap(float(np.sqrt(sum(np.sum(own**2) for own in away))), float(np.sqrt(np.sum(moved**2))))
-
-
-def reach(problem: Problem, a: Point, b: Point) -> Gap:
-    """What lies between two answers, so much at least that a part of it (`new`) is another place."""
-    gap = distance(problem, a, b)
-    return gap._replace(tracks=max(gap.tracks, FAINT * extent(problem, b)))
-
-
-def extent(problem: Problem, point: Point) -> float:
-    """Root of the sum of squares of the places of a point about their mean, as `distance` counts."""
-    return float(np.sqrt(sum(np.sum((own - own.mean(0)) ** 2) for own in problem.positions(point.states))))
-
-
-def new(problem: Problem, point: Point, known: Sequence[Point], size: Gap) -> bool:
-    """Whether a point lies apart from all that are known, by a good part of the size of a reflection."""
-    gaps = [distance(problem, point, other) for other in known]
-    nodes = size.nodes if size.nodes > SHIFTED else np.inf
-    tracks = size.tracks if size.tracks > 0 else np.inf
-    return all(gap.tracks > APART * tracks or gap.nodes > APART * nodes for gap in gaps)

@@ -21,8 +21,8 @@ from probcal.gaussian.engine import Expansion, Factors, Spread
 from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import Point
+from probcal.modes.explore import Mirrored
 from probcal.modes.grid import track_mode
-from probcal.modes.mirrors import Mirrored
 from probcal.priors import PRECISION_BOUNDS, Prior
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL

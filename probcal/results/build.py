@@ -15,7 +15,7 @@ from probcal.gaussian.mode import Point
 from probcal.labels import AXES
 from probcal.lazy import xr
 from probcal.model.motions import level_values
-from probcal.modes.mirrors import SAME
+from probcal.modes.explore import SAME
 from probcal.results.accessor import register
 from probcal.results.answer import Answer, Draws, Summary, Tracks
 from probcal.results.groups import (
