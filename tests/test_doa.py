@@ -5,7 +5,7 @@ import pytest
 
 from probcal import InputError
 from probcal.doa import bearing_track, match, similarity, turn_of
-from probcal.modes.modified import step
+from probcal.doa.modified import step
 
 STD = np.deg2rad(1.0)
 PLACES = np.array([(0.0, 0.0), (120.0, 30.0), (200.0, -60.0), (60.0, -110.0), (-80.0, 40.0)])

@@ -17,7 +17,7 @@ from probcal import Bias, Channel, ConstantVelocity, InputError, Network, Node, 
 from probcal.geometry import bearing, norm
 from probcal.modes import automatic, grid, optima
 from probcal.modes.recognise import kinds, seen_directions
-from probcal.sensors import doa, radar, ranger, rss, tdoa, toa
+from probcal.sensors import doa, radar, ranger, tdoa, toa
 from probcal.types import float64
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
@@ -55,12 +55,10 @@ def rows_of(network, motion, **settings):
     ("kind", "channel", "family", "sign", "shift"),
     [
         (doa, "azimuth", "azimuth", 1.0, 0.0),
-        (radar, "range", "range", 1.0, 0.0),
+        (radar, "range", None, None, None),
         (radar, "azimuth", "azimuth", 1.0, 0.0),
-        (ranger, "range", "range", 1.0, 0.0),
-        (toa, "arrival", "arrival", 1.0, None),
-        (tdoa, "difference", "difference", 1.0, 0.0),
-        (rss, "level", "level", -20.0, None),
+        (toa, "arrival", None, None, None),
+        (tdoa, "difference", None, None, None),
         (compass_card, "azimuth", "azimuth", -1.0, np.pi / 2),
         (compass_card, "speed", None, None, None),
     ],

@@ -4,18 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from probcal.doa.modified import Bearings, SensorTrack, all_six, back, bearings_of, step, track_of, velocity_of
 from probcal.linalg import pseudo_inverse, solve_square
-from probcal.modes.modified import (
-    GAMMA,
-    Bearings,
-    SensorTrack,
-    all_six,
-    back,
-    bearings_of,
-    step,
-    track_of,
-    velocity_of,
-)
+from probcal.modes.straight import GAMMA, wrapped
 
 
 def bearing_track(
@@ -99,7 +90,7 @@ class _Filter(NamedTuple):
             if data.there[k]:
                 R = np.diag(data.sigma[k, : len(data.seen)] ** 2)
                 K = solve_square(H @ P @ H.T + R, H @ P).T
-                x = x + K @ data.innovation(x[data.seen], data.angles[k, : len(data.seen)])
+                x = x + K @ wrapped(data.angles[k, : len(data.seen)] - x[data.seen])
                 P = (np.eye(n) - K @ H) @ P @ (np.eye(n) - K @ H).T + K @ R @ K.T
             states[k], covariances[k] = x, P
         for k in range(k0 - 1, -1, -1):

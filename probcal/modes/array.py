@@ -1,16 +1,35 @@
 """Self-calibration of an array from directions alone: each sensor's own tracks, matched by similar triangles."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from probcal.errors import InputError
 from probcal.linalg import pseudo_inverse
-from probcal.modes.modified import SensorTrack, step
 from probcal.modes.triangles import similarity, turn_of
 
 POINTS = 20  # times at which two tracks are compared
+
+
+class DirectionTrack(Protocol):
+    """A target in the axes of one sensor, up to scale."""
+
+    @property
+    def time(self) -> np.ndarray:
+        """Times (T,)."""
+
+    @property
+    def place(self) -> np.ndarray:
+        """Places (T, d) relative to the sensor."""
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """Velocities (T, d)."""
+
+    @property
+    def spread(self) -> np.ndarray:
+        """Covariances (T, d, d) of the places."""
 
 
 class Array(NamedTuple):
@@ -42,19 +61,10 @@ class _Path(NamedTuple):
         return place, self.spread[np.searchsorted(self.time, time).clip(0, len(self.time) - 1)]
 
 
-def _at(track: SensorTrack, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places (T, d) of a sensor's own track at times within it, exactly along the path, and covariances (T, d, d)."""
+def _at(track: DirectionTrack, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places (T, d) of a sensor's own track at times within it, straight on from the nearest, covariances (T, d, d)."""
     near = np.abs(time[:, None] - track.time).argmin(1)
-    d = track.place.shape[1]
-    kept = [0, 2, 3, 5] if d == 2 else list(range(6))
-    place = np.empty((len(time), d))
-    for k, (i, t) in enumerate(zip(near, time, strict=True)):
-        whole = np.zeros(6)
-        whole[kept] = track.state[i]
-        w = step(whole, t - track.time[i])[0]
-        sight = np.array([np.cos(w[4]) * np.cos(w[3]), np.cos(w[4]) * np.sin(w[3]), np.sin(w[4])])
-        place[k] = sight[:d] / w[5]
-    return place, track.spread[near]
+    return track.place[near] + (time - track.time[near])[:, None] * track.velocity[near], track.spread[near]
 
 
 def _common(a: np.ndarray, b: np.ndarray) -> np.ndarray | None:
@@ -63,7 +73,9 @@ def _common(a: np.ndarray, b: np.ndarray) -> np.ndarray | None:
     return np.linspace(low, high, POINTS) if high > low else None
 
 
-def match(tracks: Mapping[tuple[str, str], SensorTrack], *, reference: str | None = None, level: bool = False) -> Array:
+def match(
+    tracks: Mapping[tuple[str, str], DirectionTrack], *, reference: str | None = None, level: bool = False
+) -> Array:
     """Places and turns of sensors from their own tracks of the same targets (similar triangles; DOA paper, section 3).
 
     `tracks` by (sensor, target), each up to scale, at times of its own. The `reference` (the sensor with the most
@@ -112,12 +124,12 @@ def match(tracks: Mapping[tuple[str, str], SensorTrack], *, reference: str | Non
     )
 
 
-def _targets(tracks: Mapping[tuple[str, str], SensorTrack], sensor: str) -> list[str]:
+def _targets(tracks: Mapping[tuple[str, str], DirectionTrack], sensor: str) -> list[str]:
     return [target for s, target in tracks if s == sensor]
 
 
 def _reach_targets(
-    tracks: Mapping[tuple[str, str], SensorTrack],
+    tracks: Mapping[tuple[str, str], DirectionTrack],
     position: dict[str, np.ndarray],
     rotation: dict[str, np.ndarray],
     paths: dict[str, _Path],
@@ -158,7 +170,7 @@ def _reach_targets(
 
 
 def _reach_sensors(
-    tracks: Mapping[tuple[str, str], SensorTrack],
+    tracks: Mapping[tuple[str, str], DirectionTrack],
     position: dict[str, np.ndarray],
     rotation: dict[str, np.ndarray],
     paths: dict[str, _Path],

@@ -9,9 +9,9 @@ from probcal.gaussian.mode import Point
 from probcal.geometry import attitude
 from probcal.labels import AXES
 from probcal.linalg import nearest_rotation
-from probcal.modes.array import Array, match
-from probcal.modes.modified import SensorTrack, straight_track
+from probcal.modes.array import Array, DirectionTrack, match
 from probcal.modes.recognise import Directions, kinds, members, seen_directions
+from probcal.modes.straight import StraightTrack, straight_track
 from probcal.problem import Problem
 
 WIDE = 0.3  # rad, spread of a heading from which the grid alone is not trusted
@@ -209,7 +209,7 @@ def _matched(problem: Problem, seen: list[Directions], turning: dict[str, tuple[
     level = problem.network.dimension == 3 and not any(
         {"pitch", "roll"} & set(part) for part in members(problem).values()
     )
-    tracks: dict[tuple[str, str], SensorTrack] = {}
+    tracks: dict[tuple[str, str], DirectionTrack] = {}
     for target in dict.fromkeys(s.target for s in seen):
         for piece, own in enumerate(_straight([s for s in seen if s.target == target])):
             tracks |= {(node, f"{target} {piece}"): track for node, track in own.items()}
@@ -220,7 +220,7 @@ def _matched(problem: Problem, seen: list[Directions], turning: dict[str, tuple[
     yield from laid(problem, array, turning)
 
 
-def _straight(seen: list[Directions]) -> Iterator[dict[str, SensorTrack]]:
+def _straight(seen: list[Directions]) -> Iterator[dict[str, StraightTrack]]:
     """Single-sensor tracks by node of the pieces of one target that are nearly straight."""
     low, high = min(s.time[0] for s in seen), max(s.time[-1] for s in seen)
     waiting = [(low, high, 1)]
@@ -235,7 +235,7 @@ def _straight(seen: list[Directions]) -> Iterator[dict[str, SensorTrack]]:
             turned = np.ptp(np.unwrap(angles[:, 0])) / np.median(s.std[mine, 0])
             if turned < TURNED:
                 continue
-            track = straight_track(s.time[mine], angles[:, 0] if angles.shape[1] == 1 else angles, s.std[mine])
+            track = straight_track(s.time[mine], angles, s.std[mine])
             found[s.node] = track
             bent = max(bent, 2 * track.cost / mine.sum() / angles.shape[1])
         if bent > BENT and parts < PIECES:

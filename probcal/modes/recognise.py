@@ -1,7 +1,7 @@
-"""What a declared sensor measures, found by trying its function: a direction, a range, an arrival, a level.
+"""Directions that a declared sensor measures, found by trying its function.
 
-A user declares a function, not a family. Tried at random places and poses, its channels are compared with the
-geometry that each family has in closed form; what fits none is left to the grid.
+A user declares a function, not a family. Tried at random places and poses, its channels are compared with azimuth and
+elevation; what is neither is left to the grid.
 """
 
 from collections.abc import Mapping
@@ -12,9 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.geometry import bearing, elevation, norm
+from probcal.geometry import bearing, elevation
 from probcal.labels import AXES
-from probcal.linalg import least_squares
 from probcal.network import ANGLES, CLOCK, MOVING
 from probcal.noise import guess_of
 from probcal.problem import Problem
@@ -29,7 +28,7 @@ STEP = 0.1  # by which a bias is moved to see whether it turns or shifts a chann
 class Kind(NamedTuple):
     """What a channel measures: `sign` times the geometry plus `shift`; `by` is what each own bias adds, per unit."""
 
-    family: str  # "azimuth", "elevation", "range", "arrival", "difference", "level"
+    family: str  # "azimuth", "elevation"
     sign: float
     shift: float
     by: Mapping[str, float]
@@ -42,7 +41,7 @@ def kinds(problem: Problem) -> dict[tuple[str, str], Kind]:
     return {
         (kind.name, name): found
         for kind in problem.network.types
-        if d in kind.dimensions
+        if d in kind.dimensions and kind.arity == 1
         for name, found in _tried(kind, d).items()
     }
 
@@ -55,10 +54,8 @@ def _tried(kind: SensorType, d: int) -> dict[str, Kind]:
     extras = sorted(kind.pose_components - {"position", *ANGLES, *CLOCK, *MOVING})
     names = list(kind.biases)
     place = rng.normal(size=(TRIALS, d)) * 50.0
-    nodes = rng.normal(size=(TRIALS, kind.arity, d)) * 50.0
-    turned = rng.uniform(-0.4, 0.4, size=(TRIALS, kind.arity, len(ANGLES))) * [
-        name in kind.pose_components for name in ANGLES
-    ]
+    nodes = rng.normal(size=(TRIALS, d)) * 50.0
+    turned = rng.uniform(-0.4, 0.4, size=(TRIALS, len(ANGLES))) * [name in kind.pose_components for name in ANGLES]
 
     def width(name: str) -> tuple[int, ...]:
         return (d,) if name in kind.vectors else ()
@@ -66,18 +63,15 @@ def _tried(kind: SensorType, d: int) -> dict[str, Kind]:
     def one(p: jax.Array, s: jax.Array, angles: jax.Array, level: jax.Array, biases: jax.Array) -> tuple:
         own = {name: jnp.full(width(name), 1.0 + 0.1 * k) * level for k, name in enumerate(others)}
         target = TargetView("the target", {"position": p, "velocity": jnp.zeros(d), "acceleration": jnp.zeros(d)} | own)
-        poses = []
-        for a in range(kind.arity):
-            parts = {"position": s[a], "velocity": jnp.zeros(d), "clock": jnp.zeros(())}
-            parts |= dict.fromkeys((*CLOCK, *MOVING[2:]), jnp.zeros(()))
-            parts |= {name: jnp.zeros(width(name)) for name in extras}
-            poses.append(PoseView("the node", parts | dict(zip(ANGLES, angles[a], strict=True))))
+        parts = {"position": s, "velocity": jnp.zeros(d), "clock": jnp.zeros(())}
+        parts |= dict.fromkeys((*CLOCK, *MOVING[2:]), jnp.zeros(()))
+        parts |= {name: jnp.zeros(width(name)) for name in extras}
+        pose = PoseView("the node", parts | dict(zip(ANGLES, angles, strict=True)))
         value = kind.evaluate(
-            target, poses, {n: kind.biases[n].nominal + b for n, b in zip(names, biases, strict=True)}
+            target, [pose], {n: kind.biases[n].nominal + b for n, b in zip(names, biases, strict=True)}
         )
-        local = [pose.local(p) for pose in poses]
-        shape = [bearing(local[0]), elevation(local[0]) if d == 3 else jnp.zeros(()), norm(local[0])]
-        return value, jnp.stack([*shape, norm(local[-1]) - norm(local[0])])
+        local = pose.local(p)
+        return value, jnp.stack([bearing(local), elevation(local) if d == 3 else jnp.zeros(())])
 
     look = jax.jit(jax.vmap(one, (0, 0, 0, None, None)))
 
@@ -93,43 +87,23 @@ def _tried(kind: SensorType, d: int) -> dict[str, Kind]:
         unit = np.pi / 180 if channel.unit == "deg" else 1.0
         own = {n: (v[:, c] - value[:, c]) / STEP for n, v in moved.items()}
         by = {n: float(v[0]) for n, v in own.items() if np.ptp(v) < EXACT * max(1.0, abs(v[0])) and abs(v[0]) > EXACT}
-        if kind.arity > 2:
-            continue
-        kind_of = _family(value[:, c] * unit, other[:, c] * unit, shape, kind.arity, channel.period is not None)
+        kind_of = _family(value[:, c] * unit, other[:, c] * unit, shape, channel.period is not None)
         if kind_of is not None:
             found[name] = Kind(*kind_of, by)
     return found
 
 
-def _family(
-    value: np.ndarray, other: np.ndarray, shape: np.ndarray, arity: int, wraps: bool
-) -> tuple[str, float, float] | None:
+def _family(value: np.ndarray, other: np.ndarray, shape: np.ndarray, wraps: bool) -> tuple[str, float, float] | None:
     """Family, sign and shift of a channel: its values with the target's other components at one level and another."""
-    azimuth, elevation_, distance, difference = shape.T
-    if arity == 2:
-        return _shifted("difference", value, difference)
-    if wraps or np.ptp(azimuth) == 0:
-        for sign in (1.0, -1.0):
-            turn = np.exp(1j * (value - sign * azimuth)).mean()
-            if abs(turn) > 1 - EXACT**2 and np.allclose(value, other):
-                return "azimuth", sign, float(np.angle(turn))
-    if np.ptp(elevation_) > 0 and (found := _shifted("elevation", value, elevation_)):
-        return found
-    if found := _shifted("range", value, distance):
-        return found if np.allclose(value, other) else ("arrival", *found[1:])
-    log = np.stack([np.ones_like(distance), np.log10(distance)], 1)
-    fit = least_squares(log, value)
-    if abs(fit[1]) > EXACT and np.abs(log @ fit - value).max() < EXACT * max(1.0, np.abs(value).max()):
-        return "level", float(fit[1]), float(fit[0])
-    return None
-
-
-def _shifted(family: str, value: np.ndarray, shape: np.ndarray) -> tuple[str, float, float] | None:
-    """The family where the values are its geometry, either sign, with a constant added."""
+    azimuth, height = shape.T
     for sign in (1.0, -1.0):
-        left = value - sign * shape
+        turn = np.exp(1j * (value - sign * azimuth)).mean()
+        if (wraps or np.ptp(azimuth) == 0) and abs(turn) > 1 - EXACT**2 and np.allclose(value, other):
+            return "azimuth", sign, float(np.angle(turn))
+    for sign in (1.0, -1.0) if np.ptp(height) > 0 else ():
+        left = value - sign * height
         if np.ptp(left) < EXACT * max(1.0, np.abs(value).max()):
-            return family, sign, float(left.mean())
+            return "elevation", sign, float(left.mean())
     return None
 
 

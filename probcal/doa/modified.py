@@ -10,10 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.linalg import pseudo_inverse, singular, solve_square
+from probcal.modes.straight import straight_track, wrapped
 
 PLANE = [0, 2, 3, 5]  # of the six in space, with q = e = 0
-GAMMA = 0.1  # 1/s, prior sd of the radial speed over the range
 STEEP = 1e-6  # cosine of the elevation below which the azimuth has no meaning
 
 
@@ -30,6 +29,14 @@ class SensorTrack(NamedTuple):
     place: np.ndarray
     spread: np.ndarray
     cost: float
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """Velocity (T, d) at each time, in units of the range per s."""
+        found = [
+            velocity_of(x)[1] / x[5] for x in all_six(self.state, PLANE if self.state.shape[1] == 4 else list(range(6)))
+        ]
+        return np.array(found)[:, : self.place.shape[1]]
 
 
 class Axes(NamedTuple):
@@ -109,7 +116,7 @@ def step(state: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
     unit = np.zeros(6)
     unit[5] = 1.0
     found, slope = back(axes.u + dt * velocity, velocity, state[5], sight + dt * moved, moved, unit)
-    found[3] = state[3] + (found[3] - state[3] + np.pi) % (2 * np.pi) - np.pi
+    found[3] = state[3] + wrapped(found[3] - state[3])
     return found, slope
 
 
@@ -145,19 +152,14 @@ class Bearings(NamedTuple):
 
     def cost(self, state: np.ndarray) -> float:
         """Half the weighted sum of squares of the bearings."""
-        left = self.innovation(state[:, self.seen], self.angles[:, : len(self.seen)])
+        left = wrapped(self.angles[:, : len(self.seen)] - state[:, self.seen])
         return float(0.5 * np.sum((left / self.sigma[:, : len(self.seen)])[self.there] ** 2))
-
-    @staticmethod
-    def innovation(predicted: np.ndarray, measured: np.ndarray) -> np.ndarray:
-        """Measured less predicted angles, in rad from -pi to pi."""
-        return (measured - predicted + np.pi) % (2 * np.pi) - np.pi
 
     def start(self) -> tuple[int, np.ndarray, np.ndarray]:
         """Sample of the second bearing, and the state and covariance there (4)."""
         a, k = np.flatnonzero(self.there)[:2]
         dt = self.time[k] - self.time[a]
-        turned = self.innovation(self.angles[a], self.angles[k]) / dt
+        turned = wrapped(self.angles[k] - self.angles[a]) / dt
         x = np.array([turned[0], turned[1], 0.0, self.angles[k, 0], self.angles[k, 1], 1.0 / self.distance])
         P = np.zeros((6, 6))
         level = max(np.cos(self.angles[k, 1]), STEEP)
@@ -170,80 +172,23 @@ class Bearings(NamedTuple):
         P[2, 2] = self.gamma**2
         return int(k), x[self.kept], P[np.ix_(self.kept, self.kept)]
 
-    def _seen_from(self, x: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Angles (T, 2) after t (T,) s of a straight path from the state x (6,), and their derivatives (T, 2, 6)."""
-        axes, velocity, sight, moved = velocity_of(x)
-        p = axes.u + t[:, None] * velocity
-        at = axes_of(np.arctan2(p[:, 1], p[:, 0]), np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])))
-        dp = (sight + t[:, None, None] * moved) / np.sqrt((p**2).sum(1))[:, None, None]
-        slope = np.stack([(at.b[:, None] @ dp)[:, 0] / at.level[:, None], (at.e[:, None] @ dp)[:, 0]], 1)
-        return np.stack([np.arctan2(p[:, 1], p[:, 0]), np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1]))], 1), slope
-
-    def _linear(self, t: np.ndarray) -> np.ndarray:
-        """State (6,) of the straight path that the lines of sight miss least: linear, so that it needs no start."""
-        u = axes_of(self.angles[self.there, 0], self.angles[self.there, 1]).u
-        dt = t[self.there] / max(float(np.abs(t).max()), 1e-300)
-        across = np.eye(3) - u[:, :, None] * u[:, None, :]
-        rows = np.concatenate([across, dt[:, None, None] * across], 2).reshape(-1, 6)
-        if len(self.kept) == 4:  # nothing leaves the plane
-            rows = np.concatenate([rows, 1e3 * np.eye(6)[[2, 5]]])
-        path = singular(rows)[2][-1]
-        ahead = (u * (path[:3] + dt[:, None] * path[3:])).sum(1)
-        path = path * (np.sign(ahead.sum()) or 1.0)
-        size = max(float(np.linalg.norm(path[:3])), 1e-12)
-        b, e = np.arctan2(path[1], path[0]), np.arctan2(path[2], np.hypot(path[0], path[1]))
-        axes, velocity = axes_of(b, e), path[3:] / size / max(float(np.abs(t).max()), 1e-300)
-        return np.array([velocity @ axes.b, velocity @ axes.e, velocity @ axes.u, b, e, 1.0])
-
     def straight(self) -> tuple[np.ndarray, np.ndarray]:
-        """States (T, n) and covariances of the straight path of all bearings, the best of two starts (Marquardt)."""
-        k0, first, _ = self.start()
-        t = self.time - self.time[k0]
-        free = [i for i in self.kept if i != 5]
-        found = [self._climb(x, t, free) for x in (self._linear(t), all_six(first, self.kept))]
-        x, J, _ = min(found, key=lambda f: f[2])
-        covariance = np.zeros((6, 6))
-        covariance[np.ix_(free, free)] = pseudo_inverse(J, symmetric=True)
-        moved = [step(x, dt) for dt in t]
-        states, slope = np.array([m[0] for m in moved]), np.array([m[1] for m in moved])
-        log = slope[:, 5] / states[:, 5:]
-        states[:, 5] /= self.distance * states[0, 5]  # the first range is given
-        slope[:, 5] = states[:, 5:] * (log - log[0])
-        spread = slope @ covariance @ slope.mT
-        own = np.ix_(range(len(t)), self.kept, self.kept)
-        return states[:, self.kept], spread[own]
-
-    def _climb(self, x: np.ndarray, t: np.ndarray, free: list[int]) -> tuple[np.ndarray, np.ndarray, float]:
-        """State (6,) of least cost next to x, its information over the free entries, and the cost."""
-        there, damping = self.there, 1e-3
-        columns = [0] if len(self.kept) == 4 else [0, 1]
-
-        def look(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-            angles, slope = self._seen_from(x, t[there])
-            sigma = self.sigma[there][:, columns]
-            left = self.innovation(angles[:, columns], self.angles[there][:, columns]) / sigma
-            H = (slope[:, columns][:, :, free] / sigma[..., None]).reshape(-1, len(free))
-            J, score = H.T @ H, H.T @ left.ravel()
-            rho = free.index(2)
-            J[rho, rho] += self.gamma**-2
-            score[rho] -= x[2] * self.gamma**-2
-            return float(0.5 * np.sum(left**2) + 0.5 * (x[2] / self.gamma) ** 2), J, score
-
-        cost, J, score = look(x)
-        for _ in range(60):
-            trial = x.copy()
-            trial[free] += solve_square(J + damping * np.diag(np.diagonal(J) + 1e-12), score)
-            new = look(trial)
-            if np.isfinite(new[0]) and new[0] <= cost:
-                done = cost - new[0] < 1e-10 * (1 + cost)
-                x, (cost, J, score), damping = trial, new, max(damping / 5, 1e-12)
-                if done:
-                    break
-            else:
-                damping *= 5
-                if damping > 1e12:
-                    break
-        return x, J, cost
+        """States (T, n) and covariances of the straight path of all bearings."""
+        seen = range(len(self.seen))
+        found = straight_track(
+            self.time[self.there], self.angles[self.there][:, seen], self.sigma[self.there][:, seen], self.gamma
+        )
+        d = len(seen) + 1
+        there = np.concatenate([np.arange(d), 3 + np.arange(d)])
+        first, by = np.zeros(6), np.eye(6)[:, there]
+        first[there] = found.state
+        states, slopes = np.zeros((len(self.time), 6)), np.zeros((len(self.time), 6, 2 * d))
+        for k, t in enumerate(self.time - self.time[0]):
+            place, moved = first[:3] + t * first[3:], by[:3] + t * by[3:]
+            states[k], slopes[k] = back(place, first[3:], 1.0 / self.distance, moved, by[3:], np.zeros(2 * d))
+        states[:, 3] = np.unwrap(states[:, 3])
+        spread = slopes @ found.covariance @ slopes.mT
+        return states[:, self.kept], spread[:, self.kept][:, :, self.kept]
 
 
 def bearings_of(
@@ -276,9 +221,3 @@ def track_of(bearings: Bearings, state: np.ndarray, covariance: np.ndarray) -> S
     place, jacobian = places_of_states(state, bearings.kept)
     spread = jacobian @ covariance @ jacobian.mT
     return SensorTrack(bearings.time, state, covariance, place, spread, bearings.cost(state))
-
-
-def straight_track(time: np.ndarray, angles: np.ndarray, std: np.ndarray | float) -> SensorTrack:
-    """The straight path at constant speed that fits all bearings best; arguments as in `doa.bearing_track`."""
-    bearings = bearings_of(time, angles, std, GAMMA, None)
-    return track_of(bearings, *bearings.straight())
