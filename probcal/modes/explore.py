@@ -125,14 +125,13 @@ def explore(problem: Problem, point: Point, climb: SideClimb, proposals: Sequenc
             break
         first = others[0]
         way, here = (first.name, first.kind), _Here(problem, climb, first.point)
-    near = [other for other in others if other.gain > -NEAR]
-    near.sort(key=lambda one: (one.gain <= -SAME, one.kind != SCENE, -one.gain))
+    others.sort(key=lambda one: (one.gain <= -SAME, one.kind != SCENE, -one.gain))
     if way is None:
-        return Sides(point, False, tuple(near[:MOST]))
+        return Sides(point, False, tuple(others[:MOST]))
     gain = here.evidence - given.evidence
     if not np.isfinite(gain):  # nothing was found at the given place itself
         return Sides(point, False, ())
-    return Sides(here.point, True, tuple(near[:MOST]), way[0], gain, way[1])
+    return Sides(here.point, True, tuple(others[:MOST]), way[0], gain, way[1])
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ import numpy as np
 
 from probcal import linalg
 from probcal.errors import InputError, nearest
-from probcal.inference.identity import declared_identity
 from probcal.inference.widen import widening_factors
 from probcal.labels import NOBODY, label_parts
 from probcal.lazy import Later
@@ -38,6 +37,7 @@ from probcal.stream.filters.filtering import RULES, FilterForm, FilterGiven, Row
 from probcal.stream.filters.lag import Window, run_plain, run_window
 from probcal.stream.filters.particles import Cloud
 from probcal.stream.filters.starts import FIRST, place_new
+from probcal.stream.identity import declared_identity
 from probcal.stream.relearnt import relearnt
 from probcal.stream.surveillance import ChangePoint, StreamData, Surveillance, data_in_order
 from probcal.stream.watched import calibration_tree
