@@ -11,6 +11,7 @@ from probcal.labels import AXES
 from probcal.linalg import nearest_rotation
 from probcal.modes.array import Array, DirectionTrack, match
 from probcal.modes.recognise import Directions, kinds, members, seen_directions
+from probcal.modes.reflections import node_places
 from probcal.modes.straight import StraightTrack, straight_track
 from probcal.problem import Problem
 
@@ -67,12 +68,13 @@ def _turning(problem: Problem) -> dict[str, tuple[int, float]]:
 
 def _stated(problem: Problem) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     """Stated places (d,) and headings of the nodes at rest, held biases added."""
-    d = problem.network.dimension
-    nodes = [n for n in problem.network.nodes if n.path is None]
-    fixed = problem.fixed
-    place = {n.name: n.position + [fixed.get(f"{n.name}.position_{a}", 0.0) for a in AXES[:d]] for n in nodes}
+    place = node_places(problem, np.zeros(problem.model.biases))
     turning = {n.name for s in problem.network.sensors if "heading" in s.type.pose_components for n in s.nodes}
-    turn = {n.name: float(n.components["heading"]) + fixed.get(f"{n.name}.heading", 0.0) for n in nodes}
+    turn = {
+        n.name: float(n.components["heading"]) + problem.fixed.get(f"{n.name}.heading", 0.0)
+        for n in problem.network.nodes
+        if n.name in place
+    }
     return place, {name: angle if name in turning else 0.0 for name, angle in turn.items()}
 
 
@@ -250,7 +252,7 @@ def laid(problem: Problem, array: Array, turning: dict[str, tuple[int, float]] |
     turning = _turning(problem) if turning is None else turning
     place, turn = _stated(problem)
     own, d, extent = members(problem), problem.network.dimension, _extent(problem)
-    names = list(array.position)
+    names, stated = list(array.position), {node.name: node for node in problem.network.nodes}
     P, S = np.array([array.position[n] for n in names]), np.array([place[n] for n in names])
     free = [np.mean([problem.scales[m] for c, m in own[n].items() if c.startswith("position")] or [0.0]) for n in names]
     wp = 1.0 / (np.array(free) ** 2 + (KNOWN * extent) ** 2)
@@ -283,13 +285,8 @@ def laid(problem: Problem, array: Array, turning: dict[str, tuple[int, float]] |
         for name in ("pitch", "roll"):
             if name in own[n] and name in angles:
                 m = own[n][name]
-                z[m] = (float(angles[name]) - float(problem_component(problem, n, name))) / problem.scales[m]
+                z[m] = (float(angles[name]) - stated[n].components[name]) / problem.scales[m]
     yield z
-
-
-def problem_component(problem: Problem, node: str, name: str) -> float:
-    """Stated value of a component of a node."""
-    return next(float(n.components[name]) for n in problem.network.nodes if n.name == node)
 
 
 def _turns(

@@ -64,18 +64,18 @@ def nodes(problem: Problem, point: Point, most: float = np.inf) -> Iterator[Cand
             worth = own.losses(problem.model, point, other) - here
             for k, apart in zip(moving, aside, strict=True):
                 if apart > ASIDE and worth[k] < drop[k]:
-                    drop[k], settled[k] = worth[k], other[own.of_node(k)]
+                    drop[k], settled[k] = worth[k], other[own.of_node(k, len(z))]
     better = [[k for k in together if drop[k] < 0.0] for together in sets]
     if len(most_of := max(better, key=len)) > 1:
         whole = z.copy()
         for k in most_of:
-            whole[own.of_node(k)] = settled[k]
+            whole[own.of_node(k, len(z))] = settled[k]
         name = f"{len(most_of)} nodes elsewhere beside the paths that they hear"
         yield Candidate(name, NODE, point._replace(z=jnp.asarray(whole)))
     for k in sorted(settled, key=lambda k: drop[k]):
         if drop[k] < min(WORSE * own.count[k], most):
             other = z.copy()
-            other[own.of_node(k)] = settled[k]
+            other[own.of_node(k, len(z))] = settled[k]
             now = node_places(problem, other)[names[k]]
             crossed = paths[k].distance(now) * paths[k].distance(place[names[k]]) < 0
             where = "on the other side of the path" if crossed else "elsewhere beside the path"
@@ -105,87 +105,73 @@ class _Own:
     """Which biases and which data are those of one node alone, of K nodes."""
 
     biases: np.ndarray  # (K, P), M of none
-    place: np.ndarray  # (M + 1, 2) node and position in `biases` of each bias, -1 of none
     nodes: list[np.ndarray]  # of each block the nodes (N, p) of the sensor of each row, -1 of none
     count: np.ndarray  # (K,) data
 
     @classmethod
     def of(cls, problem: Problem, names: list[str], heard: list[np.ndarray]) -> "_Own":
         """Of named nodes: their own biases, and those of sensors that have no other node."""
-        number, M = {name: k for k, name in enumerate(names)}, problem.model.biases
         alone = {sensor.name: sensor.nodes[0].name for sensor in problem.network.sensors if len(sensor.nodes) == 1}
-        lists: list[list[int]] = [[] for _ in names]
-        place = np.full((M + 1, 2), -1)
+        lists: dict[str, list[int]] = {name: [] for name in names}
         for m, bias in enumerate(problem.biases):
-            k = number.get(bias.owner, number.get(alone.get(bias.owner, ""), -1))
-            if k >= 0:
-                place[m] = k, len(lists[k])
-                lists[k].append(m)
-        biases = np.full((len(names), max(map(len, lists))), M)
-        for k, listed in enumerate(lists):
-            biases[k, : len(listed)] = listed
+            lists.get(bias.owner, lists.get(alone.get(bias.owner, ""), [])).append(m)
+        biases = np.full((len(names), max(map(len, lists.values()))), problem.model.biases)
+        for row, own in zip(biases, lists.values(), strict=True):
+            row[: len(own)] = own
         data = problem.model.rows
         nodes = [own[np.asarray(rows.sensor)] for own, rows in zip(heard, data, strict=True)]
-        count = np.zeros(len(names))
-        for own, rows in zip(nodes, data, strict=True):
-            _add(count, own, np.asarray(rows.mask).sum(1))
-        return cls(biases, place, nodes, count)
+        counts = [np.asarray(rows.mask).sum(1) for rows in data]
+        return cls(biases, nodes, _by_node(nodes, counts, len(names)))
 
-    def of_node(self, k: int) -> np.ndarray:
-        """Biases of one node."""
-        return self.biases[k][self.biases[k] < len(self.place) - 1]
-
-    def settled(self, model: Model, point: Point, z: np.ndarray, moving: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Biases (M,) after all steps of some nodes, and the information (moving, P, P) about those of each."""
-        for _ in range(STEPS):
-            z, information = self.step(model, point, z, moving)
-        return z, information
+    def of_node(self, k: int, M: int) -> np.ndarray:
+        """Biases of one node, of M biases."""
+        return self.biases[k][self.biases[k] < M]
 
     def losses(self, model: Model, point: Point, z: np.ndarray) -> np.ndarray:
         """Cost (K,) of the data of each node and of its own biases under their scales."""
-        found = 0.5 * np.sum(np.append(z, 0.0)[self.biases] ** 2, 1)
-        for own, loss in zip(self.nodes, _by_row(model, point, jnp.asarray(z)), strict=True):
-            _add(found, own, np.nan_to_num(np.asarray(loss), nan=1e9, posinf=1e9))
-        return found
+        found = [
+            np.nan_to_num(loss, nan=1e9, posinf=1e9) for loss in map(np.asarray, _by_row(model, point, jnp.asarray(z)))
+        ]
+        own = 0.5 * np.sum(np.append(z, 0.0)[self.biases] ** 2, 1)
+        return own + _by_node(self.nodes, found, len(own))
 
-    def step(
-        self, model: Model, point: Point, z: np.ndarray, moving: list[int]
-    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-        """Biases (M,) after a Gauss-Newton step of some nodes each by itself, tracks and other biases held.
+    def settled(self, model: Model, point: Point, z: np.ndarray, moving: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Biases (M,) after Gauss-Newton steps of some nodes each by itself, tracks and other biases held.
 
-        And the information (moving, P, P) about the biases of each, that of their scales with it.
+        And the information (moving, P, P) about the biases of each at the last step, that of their scales with it. No
+        sensor has two of these nodes, so that a node's information is its block of that of all biases.
         """
-        (K, P), M = self.biases.shape, len(z)
-        number = np.full(K + 1, -1)
-        number[moving] = np.arange(len(moving))
-        node = number[self.place[:, 0]]  # (M + 1,) which of those that move, by bias
-        size = len(moving) * P * P
-        much, pull = np.zeros(size), -np.append(z, 0.0)[self.biases[moving]].ravel()
-        for read, lin in zip(model.read, _linearised(model, point, jnp.asarray(z)), strict=True):
-            on = np.flatnonzero((node[np.asarray(read)] >= 0).any(1))
-            read, slope, weight, score = (np.asarray(own)[on] for own in (read, lin.bias, lin.weight, lin.score))
-            whose, at = node[read], self.place[read, 1]
-            for a in range(read.shape[1]):
-                mine = whose[:, a] >= 0
-                first = whose[:, a] * P + at[:, a]
-                pull += np.bincount(first[mine], np.sum(score * slope[:, :, a], 1)[mine], len(pull))
-                for b in range(read.shape[1]):
-                    both = mine & (whose[:, b] == whose[:, a])
-                    own = np.sum(weight * slope[:, :, a] * slope[:, :, b], 1)
-                    much += np.bincount((first * P + at[:, b])[both], own[both], size)
-        information = much.reshape(-1, P, P) + np.eye(P)
-        change = solve_square(information, pull.reshape(-1, P, 1))[:, :, 0]
-        change *= STRIDE / np.maximum(np.abs(np.nan_to_num(change)).max(1, keepdims=True), STRIDE)
-        after = np.append(z, 0.0)
-        after[self.biases[moving]] += np.nan_to_num(change)
-        return after[:M], information
+        from scipy.sparse import coo_matrix  # loaded where it is used
+
+        own, after = self.biases[moving], np.append(z, 0.0)
+        moved = np.zeros(len(after), bool)
+        moved[own] = True
+        moved[-1] = False
+        at = np.broadcast_arrays(own[:, :, None], own[:, None, :])
+        information: np.ndarray = np.eye(own.shape[1])
+        for _ in range(STEPS):
+            total, pull = coo_matrix((len(after), len(after))).tocsr(), -after
+            for read, lin in zip(model.read, _linearised(model, point, jnp.asarray(after[:-1])), strict=True):
+                N, C, p = lin.bias.shape
+                column = np.broadcast_to(np.asarray(read)[:, None], (N, C, p)).ravel()
+                used = np.flatnonzero(moved[column])
+                entries = np.asarray(lin.bias).ravel()[used], (used // p, column[used])
+                slope = coo_matrix(entries, (N * C, len(after))).tocsr()
+                pull += slope.T @ np.asarray(lin.score).ravel()
+                total += slope.T @ slope.multiply(np.asarray(lin.weight).reshape(-1, 1))
+            blocks = np.asarray(total[at[0].ravel(), at[1].ravel()]).reshape(at[0].shape)
+            information = blocks + np.eye(own.shape[1])
+            change = np.nan_to_num(solve_square(information, pull[own][:, :, None])[:, :, 0])
+            after[own] += change * STRIDE / np.maximum(np.abs(change).max(1, keepdims=True), STRIDE)
+        return after[:-1], information
 
 
-def _add(total: np.ndarray, node: np.ndarray, value: np.ndarray) -> None:
-    """Add a value (N,) of each row to the total (K,) of each of its nodes (N, p), -1 of none."""
-    for slot in range(node.shape[1]):
-        mine = node[:, slot] >= 0
-        np.add.at(total, node[mine, slot], value[mine])
+def _by_node(nodes: list[np.ndarray], values: list[np.ndarray], count: int) -> np.ndarray:
+    """Total (count,) of the values (N,) of each row over its nodes (N, p), -1 of none."""
+    total = np.zeros(count + 1)
+    for own, value in zip(nodes, values, strict=True):
+        np.add.at(total, own, value[:, None])
+    return total[:count]
 
 
 def _heard(problem: Problem, first: list[int]) -> list[np.ndarray]:
@@ -197,23 +183,19 @@ def _heard(problem: Problem, first: list[int]) -> list[np.ndarray]:
 
 def _paths(problem: Problem, point: Point, heard: list[np.ndarray], place: np.ndarray) -> Iterator[tuple[int, Plane]]:
     """Line (in 3-D plane) of least squares of the places of targets that each node hears, `place` (nodes, d) theirs."""
-    d, n, model = problem.network.dimension, len(place), problem.model
-    count, total, square = np.zeros(n), np.zeros((n, d)), np.zeros((n, d, d))
+    seen: list[list[np.ndarray]] = [[] for _ in place]
     places = problem.positions(point.states)
-    for _, data, r, own in model.each_block(heard):
-        there = places[r][np.asarray(data.epoch)]
-        used = np.asarray(data.mask).any(1)
-        for slot in range(own.shape[1]):
-            node = own[:, slot][np.asarray(data.sensor)]
-            mine = used & (node >= 0)
-            away = there[mine] - place[node[mine]]
-            np.add.at(count, node[mine], 1.0)
-            np.add.at(total, node[mine], away)
-            np.add.at(square, node[mine], away[:, :, None] * away[:, None, :])
-    enough = np.flatnonzero(count >= FEW)
-    mean = total[enough] / count[enough, None]
-    values, axes = spectrum(square[enough] / count[enough, None, None] - mean[:, :, None] * mean[:, None, :])
-    for k, centre, value, axis in zip(enough.tolist(), mean, values, axes, strict=True):
+    for _, data, r, own in problem.model.each_block(heard):
+        used, node = np.asarray(data.mask).any(1), own[np.asarray(data.sensor)]
+        for k in np.unique(node[node >= 0]):
+            mine = np.flatnonzero((node == k) & used[:, None]) // node.shape[1]
+            seen[k].append(places[r][np.asarray(data.epoch)[mine]] - place[k])
+    for k, parts in enumerate(seen):
+        away = np.concatenate([np.zeros((0, place.shape[1])), *parts])
+        if len(away) < FEW:
+            continue
+        centre = away.mean(0)
+        value, axis = spectrum(away.T @ away / len(away) - np.outer(centre, centre))
         if value[-1] > STILL**2 * np.sum(centre**2):
             yield k, Plane("its path", place[k] + centre, axis[:, 0])
 

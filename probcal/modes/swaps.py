@@ -10,6 +10,7 @@ import numpy as np
 from probcal.gaussian.information import rejected
 from probcal.gaussian.mode import Point
 from probcal.modes.grid import grid_start, joint_cost, track_mode
+from probcal.modes.reflections import place_biases
 from probcal.priors import Precision
 from probcal.problem import Problem
 
@@ -23,12 +24,8 @@ GAIN = 10.0  # nats by which one must fit better than what is stated
 
 def free_places(problem: Problem) -> dict[str, list[int]]:
     """Numbers of the biases (d,) of the place of every node at rest whose place is free in all axes."""
-    place: dict[str, list[int]] = {}
-    for m, bias in enumerate(problem.biases):
-        if bias.component == "position" and bias.kind == "scale" and bias.since is None:
-            place.setdefault(bias.owner, []).append(m)
-    resting = {n.name for n in problem.network.nodes if n.path is None}
-    return {name: own for name, own in place.items() if len(own) == problem.network.dimension and name in resting}
+    d, scaled = problem.network.dimension, [bias.kind == "scale" for bias in problem.biases]
+    return {name: own for name, own in place_biases(problem).items() if sum(scaled[m] for m in own) == d}
 
 
 def swaps(problem: Problem, z: np.ndarray | None = None) -> dict[tuple[str, str], np.ndarray]:
