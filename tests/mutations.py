@@ -105,9 +105,9 @@ MUTATIONS = [
     Mutation("density(at) + orbit.volume * r", "density(at)", "test_orbits.py"),
     # modes/mirrors.py, and crossing
     Mutation("return place - 2.0 * self.distance(place)", "return place - 1.0 * self.distance(place)", "test_mirrors.py"),
-    # modes/crossings.py, inference/pruned.py, analysis/segments.py
+    # modes/crossings.py, explore.py, inference/pruned.py, analysis/segments.py
     Mutation("[-now, reach, -reach]", "[now, now]", "test_crossings.py"),
-    Mutation("if max(climbs, back) >= TRIED:", "if climbs >= TRIED:", "test_crossings.py"),
+    Mutation("if TRIED in count.values():", "if count[False] >= TRIED:", "test_crossings.py"),
     Mutation("0.0) * self.q2).gain", "1.0) * self.q2).gain", "test_crossings.py"),
     Mutation("score = np.einsum(\"bij,bj->bi\", inverse, step[members]) +", "score = 0.0 * step[members] +", "test_segments.py"),
     Mutation("self.held = HELD * (1.0 +", "self.held = 0.0 * (1.0 +", "test_segments.py"),
