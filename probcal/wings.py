@@ -32,6 +32,7 @@ NAMES = {  # public names of `probcal` by module
     "probcal.tracking.selfconfig": "SelfConfiguration",
 }
 PARTS = {  # functions of wings that verbs of the core call, by module
+    "probcal.particles.starts": "solve_by_particles",
     "probcal.tracking.tracks": "track_detections",
 }
 PICTURES = {  # public names of `probcal.plots` by module

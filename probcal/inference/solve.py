@@ -16,7 +16,7 @@ from probcal.inference.method import Context, Method
 from probcal.inference.methods import MAP
 from probcal.inference.progress import Monitor, Stopped
 from probcal.inference.run import Maximiser
-from probcal.labels import SCENE, START, listed
+from probcal.labels import START, listed
 from probcal.modes import further_starts
 from probcal.modes import optima as optima_of
 from probcal.modes.clocks import first_times, settled_times, taken_there
@@ -28,10 +28,10 @@ from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.results.modes import ELSEWHERE, LEAST
 from probcal.results.schema import DIFFERENT
+from probcal.wings import of_wing
 
 ROUNDS = 8  # answers in turn, each with the rows where the one before puts them
 STILL = 0.1  # sd by which no clock moves at the end of them
-TRIES = 3  # climbs by particles from one start
 
 
 def solve(
@@ -45,7 +45,7 @@ def solve(
     if starts < 1:
         raise InputError(f"starts={starts}: at least one start is needed")
     if not problem.clocks.any():
-        return _solve(problem, method, prior, context, start, starts)
+        return solve_timed(problem, method, prior, context, start, starts)
     monitor = context.monitor
     monitor.enter("clocks", method.name)
     if start is not None:
@@ -57,7 +57,7 @@ def solve(
             problem, point = settled_times(problem, found[0].point)
             start = point if len(found) == 1 and starts == 1 else None
     for _ in range(ROUNDS):
-        answer = _solve(problem, method, prior, context, start, starts)
+        answer = solve_timed(problem, method, prior, context, start, starts)
         if not (method.climbs and answer.posterior.sound and answer.motion == "used"):
             return answer
         summary = answer.posterior.summary
@@ -70,7 +70,7 @@ def solve(
     return answer.judged(clocks=listed(moving, 3))
 
 
-def _solve(
+def solve_timed(
     problem: Problem, method: Method, prior: Prior, context: Context, start: Point | None, starts: int
 ) -> Answer:
     """The answer of a method with every row at its time.
@@ -82,7 +82,8 @@ def _solve(
     monitor = context.monitor
     monitor.enter("start", method.name)
     if method.by_particles:
-        return _by_particles(problem, method, prior, context, start, starts)
+        found: Answer = of_wing("solve_by_particles")(problem, method, prior, context, start, starts)
+        return found
     given, problem = problem, method.prepare(problem)
     engined = _on_engine(problem, method, prior, starts)
     method, large = engined or method, engined is not None
@@ -99,17 +100,17 @@ def _solve(
     climber, own = (method, prior) if method.climbs else (MAP(trajectory="joint", engine="dense"), Gaussian())
     optima, unseen = list[Answer](), ""
     if method.climbs or len(points) > 1 or problem.levels or problem.model.tailed:
-        optima = [climber.answer(problem, own, point, context) for _, point in _starts(points, method, monitor)]
+        optima = [climber.answer(problem, own, point, context) for _, point in each_start(points, method, monitor)]
         unseen = starts_unseen(len(optima), max(len(points), starts))
         points = [optimum.posterior.point for optimum in optima]
-    best = max(range(len(optima)), key=lambda k: _rank(optima[k]), default=0)
+    best = max(range(len(optima)), key=lambda k: rank(optima[k]), default=0)
     if method.climbs:
         found = optima[best]
     else:  # with the precisions that its process noise has there
         found = method.answer(optima[best].problem if optima else problem, prior, points[best], context)
     several = tuple(optima) if len(points) > 1 else ()
     found = replace(found, motion="used" if problem is given else "left out", optima=several, best=best)
-    found = _without(found, unseen, monitor)
+    found = without(found, unseen, monitor)
     if not method.climbs or found.motion != "used":
         return found
     try:
@@ -119,7 +120,7 @@ def _solve(
     return replace(beside, mirrors=(*beside.mirrors, *_beside_optima(beside, (found, *found.optima))))
 
 
-def _starts[T](places: Sequence[T], method: Method, monitor: Monitor) -> Iterator[tuple[int, T]]:
+def each_start[T](places: Sequence[T], method: Method, monitor: Monitor) -> Iterator[tuple[int, T]]:
     """Number and place of each start in turn, until the call is stopped."""
     for k, place in enumerate(places):
         if k and monitor.stopped:
@@ -134,7 +135,7 @@ def starts_unseen(climbed: int, wanted: int) -> str:
     return "" if climbed >= wanted else f"{wanted - climbed} of {wanted} starts"
 
 
-def _without(answer: Answer, unseen: str, monitor: Monitor) -> Answer:
+def without(answer: Answer, unseen: str, monitor: Monitor) -> Answer:
     """The answer with a sentence on other answers that were not looked for, since the search was
     ended."""
     if not unseen:
@@ -178,43 +179,6 @@ def _sampled_on_best_side(problem: Problem, method: Method, prior: Prior, start:
     return replace(found, mirrors=tuple(o._replace(shift=np.asarray(o.point.z) - mean) for o in sides.others))
 
 
-def _by_particles(
-    problem: Problem, method: Method, prior: Prior, context: Context, start: Point | None, starts: int
-) -> Answer:
-    """The answer of a method whose trajectories are particles: it begins at biases, whatever the states of a start.
-
-    Where none is given it is the joint mode, mirrors seen to, with motions of a linear form in the place of others
-    (`Motion.loose`), and zero where there is none. Further starts are draws of the biases within their scales; the one
-    of the greatest evidence is the answer. A climb that particles threw off is tried again with others. Mirrored
-    answers are those of the joint mode.
-    """
-    linear = all(form is None for form in problem.model.sampled)
-    near = problem if linear else problem.loosened()
-    mirrors: tuple[Mirrored, ...] = ()
-    if start is None and near is not None:
-        silent = context._replace(monitor=context.monitor.silent())
-        first = _solve(near, MAP(trajectory="joint", engine="dense"), Gaussian(), silent, None, 1)
-        start = first.posterior.point if first.status.valid and first.posterior.sound else None
-        mirrors = first.mirrors if linear and start is not None and method.climbs else ()
-    drawn = np.random.default_rng(np.asarray(jax.random.key_data(jax.random.fold_in(context.key, 1))))
-    begin = problem.first_z if start is None else np.asarray(start.z)
-    places = [begin, *drawn.standard_normal((starts - 1, len(begin)))]
-    answers = []
-    for k, z in _starts(places, method, context.monitor):
-        key = context.key if k == 0 else jax.random.fold_in(context.key, 1 + k)
-        point = Point((), (), jnp.asarray(z), jnp.zeros(len(problem.levels)))
-        tries = [method.answer(problem, prior, point, context._replace(key=key))]
-        while method.climbs and tries[-1].status.again and len(tries) < TRIES:
-            if context.monitor.stopped:
-                break
-            other = context._replace(key=jax.random.fold_in(key, len(tries)))
-            tries.append(method.answer(problem, prior, point, other))
-        answers.append(max(tries, key=_rank))
-    best = max(range(len(answers)), key=lambda k: _rank(answers[k]))
-    found = _without(answers[best], starts_unseen(len(answers), starts), context.monitor)
-    return replace(found, optima=tuple(answers) if len(answers) > 1 else (), best=best, mirrors=mirrors)
-
-
 def _beside_mirrors(answer: Answer, method: Maximiser, context: Context) -> Answer:
     """The answer on the side of a mirror that fits best, and those of other sides that fit about as well.
 
@@ -226,15 +190,16 @@ def _beside_mirrors(answer: Answer, method: Maximiser, context: Context) -> Answ
         return answer
     problem, here, monitor = answer.problem.untilted, answer.posterior.point, context.monitor
     if monitor.stopped:
-        return answer if answer.interrupted else _without(answer, "mirror images", monitor)
+        return answer if answer.interrupted else without(answer, "mirror images", monitor)
     climb = SideClimb.on(problem, engine_of(method.engine, problem.model))
     sides = _sides_in_time(problem, here, climb, monitor)
     if sides is None:
-        return _without(answer, "mirror images", monitor)
+        return without(answer, "mirror images", monitor)
     places = [Mirrored(sides.name, 0.0, sides.point, np.zeros(0), sides.kind)] if sides.moved else []
     places = [other._replace(gain=other.gain + sides.gain) for other in (*places, *sides.others)]
-    found, unfitted, unseen = [(("", SCENE), answer)], list[Mirrored](), ""
-    skipped = 0
+    first, unseen, skipped = _weight(answer), "", 0
+    alone = Mirrored("", 0.0, here, answer.posterior.summary.mean, status=str(answer.status))
+    found: list[tuple[Mirrored, Answer | None]] = [(alone, answer)]
     for k, other in enumerate(places):
         fits, own = other.gain > -SAME, None
         if fits and not monitor.stopped:
@@ -242,32 +207,29 @@ def _beside_mirrors(answer: Answer, method: Maximiser, context: Context) -> Answ
             own = _like_first(answer, problem, method, other.point, context)
         late = fits and own is None and bool(monitor.stopped)
         skipped += late
-        if own is None:
-            if other.gain > MORE and not late:
-                unseen = f"Under the declared scales another place fits better ({other.name}), from which no fit came."
-            else:
-                unfitted.append(other)
-            continue
-        known = [one.posterior.point for _, one in found]
-        if new(problem, own.posterior.point, known, reach(problem, other.point, here)):
-            found.append(((other.name, other.kind), own))
-    first = _weight(answer)
-    better = [one for one in found[1:] if one[1].status.settled >= answer.status.settled]
-    way, best = max(better, key=lambda one: _weight(one[1]), default=found[0])
-    if _weight(best) <= first + MORE:
-        way, best = found[0]
-    gain, mean = _weight(best) - first, best.posterior.summary.mean
-    mirrors = list[Mirrored]()
-    for side, one in found:
-        if one is not best:
-            (name, kind), place = side if side[0] else way, one.posterior
-            shift, status = place.summary.mean - mean, str(one.status)
-            less = _weight(one) - first - gain
-            mirrors.append(Mirrored(name, less, place.point, shift, kind, status))
-    mirrors += [o._replace(gain=o.gain - gain, shift=np.asarray(o.point.z) - mean) for o in unfitted]
-    mirrors = sorted((other for other in mirrors if other.gain > -NEAR), key=lambda other: -other.gain)
+        if own is None and other.gain > MORE and not late:
+            unseen = f"Under the declared scales another place fits better ({other.name}), from which no fit came."
+        elif own is None:
+            found.append((other._replace(shift=np.asarray(other.point.z)), None))
+        else:
+            known = [mode.point for mode, one in found if one is not None]
+            if new(problem, own.posterior.point, known, reach(problem, other.point, here)):
+                place, gain = own.posterior, _weight(own) - first
+                found.append((Mirrored(other.name, gain, place.point, place.summary.mean, other.kind, str(own.status)), own))
+    way, best = alone, answer
+    for mode, one in found:
+        if one is not None and one.status.settled >= answer.status.settled and mode.gain > max(way.gain, MORE):
+            way, best = mode, one
+    seen = [
+        (mode if mode.name else mode._replace(name=way.name, kind=way.kind))._replace(
+            gain=mode.gain - way.gain, shift=mode.shift - way.shift
+        )
+        for mode, one in found
+        if one is not best
+    ]
+    mirrors = sorted((mode for mode in seen if mode.gain > -NEAR), key=lambda mode: -mode.gain)
     best = best.noted(unseen, motion=answer.motion, optima=answer.optima, best=answer.best, mirrors=tuple(mirrors))
-    return _without(best, f"{skipped} of {len(places)} mirror images" if skipped else "", monitor)
+    return without(best, f"{skipped} of {len(places)} mirror images" if skipped else "", monitor)
 
 
 def _sides_in_time(problem: Problem, here: Point, climb: SideClimb, monitor: Monitor) -> Sides | None:
@@ -333,6 +295,6 @@ def _suited(given: Problem, problem: Problem, start: Point) -> Point:
     return follow_states(problem, states)._replace(z=start.z)
 
 
-def _rank(answer: Answer) -> tuple[bool, bool, float]:
+def rank(answer: Answer) -> tuple[bool, bool, float]:
     """Order of optima: an answer before none, a converged one before others, then evidence (density if flat)."""
     return answer.status.valid and np.isfinite(answer.objective), answer.status.settled, answer.objective
