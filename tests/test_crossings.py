@@ -13,7 +13,7 @@ from probcal import ARD, EA, MAP, ConstantVelocity, Gaussian, Network, Node, Pro
 from probcal.inference.pruned import GroupEvidence, without_far_modes
 from probcal.labels import NODE
 from probcal.modes import automatic_start
-from probcal.modes.crossings import _parted, nodes
+from probcal.modes.crossings import _parted, crossed_nodes
 from probcal.modes.explore import TRIED, Candidate, SideClimb, Sides, explore
 from probcal.modes.grid import track_mode
 from probcal.modes.reflections import Plane, across
@@ -132,7 +132,7 @@ def test_nodes_cross_together():
     with jax.enable_x64(True):
         shifts = {f"b{k}.position_y": -2.0 * PLACES[k][1] for k in (0, 1, 2)}
         three = beside(0, 4.0, ("b0", "b1", "b2"), scale=10.0, **shifts)
-        first = next(nodes(three, automatic_start(three))).name
+        first = next(crossed_nodes(three, automatic_start(three))).name
     assert first.endswith("nodes elsewhere beside the paths that they hear")
     tree = probcal.fit(three, MAP(), prior=Gaussian())
     for label, shift in shifts.items():
@@ -207,7 +207,7 @@ def test_a_node_surveyed_on_its_side_costs_no_look():
     """Its scale is 1 m, the other side 20 m away."""
     problem = beside(0, 0.0, scale=1.0)
     with jax.enable_x64(True), patch("probcal.modes.crossings._linearised") as looked:
-        assert not list(nodes(problem, automatic_start(problem)))
+        assert not list(crossed_nodes(problem, automatic_start(problem)))
     assert not looked.called
 
 

@@ -45,10 +45,10 @@ def stored_fit(
 def identity(**settings: Any) -> dict[str, str]:
     """Settings as texts, with the versions of package and results."""
     versions = {"version of probcal": version("probcal"), "version of the results": str(RESULTS_VERSION)}
-    return versions | {name.replace("_", " "): as_text(value) for name, value in settings.items()}
+    return versions | {name.replace("_", " "): setting_text(value) for name, value in settings.items()}
 
 
-def as_text(value: Any) -> str:
+def setting_text(value: Any) -> str:
     """A setting as text, without addresses in memory."""
     return value if isinstance(value, str) else ADDRESS.sub("", repr(value))
 
@@ -100,7 +100,7 @@ def model_digest(problem: Problem) -> str:
         problem.biases, problem.fixed, problem.levels, model.recursion, model.biases, stated,
         [(e.components, e.layout) for e in problem.epochs],
     )  # fmt: skip
-    found.update(as_text(words).encode())
+    found.update(setting_text(words).encode())
     return found.hexdigest()
 
 

@@ -110,7 +110,7 @@ def solve_timed(
         found = method.answer(optima[best].problem if optima else problem, prior, points[best], context)
     several = tuple(optima) if len(points) > 1 else ()
     found = replace(found, motion="used" if problem is given else "left out", optima=several, best=best)
-    found = without(found, unseen, monitor)
+    found = noting_unseen(found, unseen, monitor)
     if not method.climbs or found.motion != "used":
         return found
     try:
@@ -135,7 +135,7 @@ def starts_unseen(climbed: int, wanted: int) -> str:
     return "" if climbed >= wanted else f"{wanted - climbed} of {wanted} starts"
 
 
-def without(answer: Answer, unseen: str, monitor: Monitor) -> Answer:
+def noting_unseen(answer: Answer, unseen: str, monitor: Monitor) -> Answer:
     """The answer with a sentence on other answers that were not looked for, since the search was
     ended."""
     if not unseen:
@@ -190,11 +190,11 @@ def _beside_mirrors(answer: Answer, method: Maximiser, context: Context) -> Answ
         return answer
     problem, here, monitor = answer.problem.untilted, answer.posterior.point, context.monitor
     if monitor.stopped:
-        return answer if answer.interrupted else without(answer, "mirror images", monitor)
+        return answer if answer.interrupted else noting_unseen(answer, "mirror images", monitor)
     climb = SideClimb.on(problem, engine_of(method.engine, problem.model))
     sides = _sides_in_time(problem, here, climb, monitor)
     if sides is None:
-        return without(answer, "mirror images", monitor)
+        return noting_unseen(answer, "mirror images", monitor)
     places = [Mirrored(sides.name, 0.0, sides.point, np.zeros(0), sides.kind)] if sides.moved else []
     places = [other._replace(gain=other.gain + sides.gain) for other in (*places, *sides.others)]
     first, unseen, skipped = _weight(answer), "", 0
@@ -229,7 +229,7 @@ def _beside_mirrors(answer: Answer, method: Maximiser, context: Context) -> Answ
     ]
     mirrors = sorted((mode for mode in seen if mode.gain > -NEAR), key=lambda mode: -mode.gain)
     best = best.noted(unseen, motion=answer.motion, optima=answer.optima, best=answer.best, mirrors=tuple(mirrors))
-    return without(best, f"{skipped} of {len(places)} mirror images" if skipped else "", monitor)
+    return noting_unseen(best, f"{skipped} of {len(places)} mirror images" if skipped else "", monitor)
 
 
 def _sides_in_time(problem: Problem, here: Point, climb: SideClimb, monitor: Monitor) -> Sides | None:

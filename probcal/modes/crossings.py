@@ -29,7 +29,7 @@ NEAR = 2.0  # scales from its path within which a node may have settled on neith
 ASIDE = 5.0  # sd from where it settles on its own side at which it stands on another: below, it came back
 
 
-def nodes(problem: Problem, point: Point, most: float = np.inf) -> Iterator[Candidate]:
+def crossed_nodes(problem: Problem, point: Point, most: float = np.inf) -> Iterator[Candidate]:
     """Each node on the other side of its path, tracks as they are, those first that fit best.
 
     Only where its free axes let it, within the reach of its scales. Its biases, and those of its sensors, settle there;

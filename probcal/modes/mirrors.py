@@ -19,7 +19,7 @@ from probcal.gaussian.information import at_levels
 from probcal.gaussian.mode import Point
 from probcal.labels import PIECE, SCENE
 from probcal.model import variants
-from probcal.modes.crossings import nodes
+from probcal.modes.crossings import crossed_nodes
 from probcal.modes.explore import MOST, PIECES, TRIED, WORSE, Candidate, SideClimb, Sides, explore
 from probcal.modes.grid import grid_start, profile
 from probcal.modes.reflections import Plane, movable, planes, reflect, reflect_nodes
@@ -38,7 +38,7 @@ STRAIN = 20.0  # sum of squares of a process noise from which a track may be cut
 def other_sides(problem: Problem, point: Point, climb: SideClimb | None = None) -> Sides:
     """Search the other sides of a point: of pieces of tracks, of nodes alone, and of all of the scene."""
     climb = SideClimb.on(problem, engine_of("dense", problem.model)) if climb is None else climb
-    return explore(problem, point, climb, (pieces, nodes, scenes))
+    return explore(problem, point, climb, (reflected_pieces, crossed_nodes, reflected_scenes))
 
 
 def _losses(problem: Problem, z: np.ndarray, point: Point, plane: Plane | None) -> list[np.ndarray]:
@@ -56,7 +56,7 @@ def _counts(problem: Problem) -> list[np.ndarray]:
     return variants.counts(problem.model, lambda mask: mask.sum(1))
 
 
-def scenes(problem: Problem, point: Point, most: float = np.inf) -> Iterator[Candidate]:
+def reflected_scenes(problem: Problem, point: Point, most: float = np.inf) -> Iterator[Candidate]:
     """Reflections of the whole scene, and of the track of one target alone, that fit nearly as well unpolished."""
     z, free, counts = np.asarray(point.z), movable(problem), _counts(problem)
     targets = [n for epochs in problem.epochs for n in epochs.members if n in problem.targets]
@@ -107,7 +107,7 @@ class _Piece(NamedTuple):
         return bool(np.linalg.norm(here - there) <= APART_BY * moved)
 
 
-def pieces(problem: Problem, point: Point, most: float = np.inf) -> Iterator[Candidate]:
+def reflected_pieces(problem: Problem, point: Point, most: float = np.inf) -> Iterator[Candidate]:
     """Pieces of tracks on the other side, those first whose data fit best there unpolished.
 
     Where there are any the whole track is searched again too, at the biases reached so far.

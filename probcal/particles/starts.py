@@ -9,7 +9,7 @@ import numpy as np
 from probcal.gaussian.mode import Point
 from probcal.inference.method import Context, Method
 from probcal.inference.methods import MAP
-from probcal.inference.solve import each_start, rank, solve_timed, starts_unseen, without
+from probcal.inference.solve import each_start, noting_unseen, rank, solve_timed, starts_unseen
 from probcal.modes.explore import Mirrored
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
@@ -51,5 +51,5 @@ def solve_by_particles(
             tries.append(method.answer(problem, prior, point, other))
         answers.append(max(tries, key=rank))
     best = max(range(len(answers)), key=lambda k: rank(answers[k]))
-    found = without(answers[best], starts_unseen(len(answers), starts), context.monitor)
+    found = noting_unseen(answers[best], starts_unseen(len(answers), starts), context.monitor)
     return replace(found, optima=tuple(answers) if len(answers) > 1 else (), best=best, mirrors=mirrors)

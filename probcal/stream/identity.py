@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from probcal.fingerprint import computes
-from probcal.inference.identity import add_array, as_text
+from probcal.inference.identity import add_array, setting_text
 from probcal.model.sampled import SampledMotion
 from probcal.motion import Component, Motion
 from probcal.network import Network, Node
@@ -29,7 +29,7 @@ def declared_identity(
     network: Network, motion: Any, calibration: xr.DataTree | None, **settings: Any
 ) -> dict[str, str]:
     """What streams must share to be one stream, by the name that an error gives it; no row is part of it."""
-    found = {name.replace("_", " "): as_text(value) for name, value in settings.items()}
+    found = {name.replace("_", " "): setting_text(value) for name, value in settings.items()}
     motions = {f"motion of {name}": own for name, own in motion.items()} if isinstance(motion, Mapping) else {}
     parts: dict[str, Any] = {f"sensor {own.name}": own for own in network.types}
     parts |= {f"sensor {own.name}": own for own in network.sensors}
@@ -74,7 +74,7 @@ def _stated(value: Any, dimension: int) -> Any:
     elif is_dataclass(value) and not isinstance(value, type):
         parts = {one.name: getattr(value, one.name) for one in fields(value)}
     else:
-        parts = {"text": as_text(value)}
+        parts = {"text": setting_text(value)}
     return [type(value).__name__, _stated(parts | _computed(value, dimension), dimension)]
 
 
