@@ -10,10 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.modes.straight import straight_track, wrapped
+from probcal.modes.straight import STEEP, straight_track, wrapped
 
 PLANE = [0, 2, 3, 5]  # of the six in space, with q = e = 0
-STEEP = 1e-6  # cosine of the elevation below which the azimuth has no meaning
 
 
 class SensorTrack(NamedTuple):

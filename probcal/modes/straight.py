@@ -8,8 +8,7 @@ from probcal.gaussian.search import climb_on_host
 from probcal.linalg import pseudo_inverse, singular
 
 GAMMA = 0.1  # 1/s, prior sd of the radial speed over the range
-LEVEL = 1e-6  # cosine of an elevation below which the azimuth has no meaning
-STEPS = 60  # of the search from one start
+STEEP = 1e-6  # cosine of the elevation below which the azimuth has no meaning
 
 
 class StraightTrack(NamedTuple):
@@ -49,9 +48,7 @@ def sights(angles: np.ndarray) -> np.ndarray:
     return whole[:, : angles.shape[1] + 1]
 
 
-def straight_track(
-    time: np.ndarray, angles: np.ndarray, std: np.ndarray, gamma: float = GAMMA
-) -> StraightTrack:  # fmt: skip
+def straight_track(time: np.ndarray, angles: np.ndarray, std: np.ndarray, gamma: float = GAMMA) -> StraightTrack:
     """The path whose directions are (T, 1) or (T, 2) angles in rad, with their stds; the best of two starts.
 
     One start is the path that the lines of sight miss least, which is linear; the other has the rates of the first two.
@@ -110,7 +107,7 @@ class _Fit(NamedTuple):
 
     def best(self) -> tuple[np.ndarray, np.ndarray, float]:
         """The path (2 d,) of least cost, its information and the cost."""
-        found, _, _ = climb_on_host(self, _Path(np.zeros(len(self.basis) - 1)), len(self.basis) - 1, STEPS, 1e-8)
+        found, _, _ = climb_on_host(self, _Path(np.zeros(len(self.basis) - 1)), len(self.basis) - 1, 60, 1e-8)
         return self.path(found.at.point), found.at.information, float(found.value)
 
     def path(self, point: _Path) -> np.ndarray:
@@ -120,7 +117,7 @@ class _Fit(NamedTuple):
         x = self.path(point)
         slope = _along(self.t, len(x))
         p, d = (slope @ x), len(x) // 2
-        flat = np.maximum(np.hypot(p[:, 0], p[:, 1]), LEVEL * np.linalg.norm(p, axis=1))
+        flat = np.maximum(np.hypot(p[:, 0], p[:, 1]), STEEP * np.linalg.norm(p, axis=1))
         predicted, H = [np.arctan2(p[:, 1], p[:, 0])], np.zeros((len(p), d - 1, d))
         H[:, 0, :2] = np.stack([-p[:, 1], p[:, 0]], 1) / flat[:, None] ** 2
         if d == 3:
