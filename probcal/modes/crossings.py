@@ -141,26 +141,23 @@ class _Own:
         And the information (moving, P, P) about the biases of each at the last step, that of their scales with it. No
         sensor has two of these nodes, so that a node's information is its block of that of all biases.
         """
-        from scipy.sparse import coo_matrix  # loaded where it is used
-
         own, after = self.biases[moving], np.append(z, 0.0)
-        moved = np.zeros(len(after), bool)
-        moved[own] = True
-        moved[-1] = False
-        at = np.broadcast_arrays(own[:, :, None], own[:, None, :])
+        node, column = np.full(len(after), -1), np.zeros(len(after), int)  # of each bias: in `moving`, and in its row
+        node[own] = np.arange(len(own))[:, None]
+        column[own] = np.arange(own.shape[1])
+        node[-1] = -1
         information: np.ndarray = np.eye(own.shape[1])
         for _ in range(STEPS):
-            total, pull = coo_matrix((len(after), len(after))).tocsr(), -after
+            blocks, pull = np.tile(np.eye(own.shape[1]), (len(own), 1, 1)), -after
             for read, lin in zip(model.read, _linearised(model, point, jnp.asarray(after[:-1])), strict=True):
-                N, C, p = lin.bias.shape
-                column = np.broadcast_to(np.asarray(read)[:, None], (N, C, p)).ravel()
-                used = np.flatnonzero(moved[column])
-                entries = np.asarray(lin.bias).ravel()[used], (used // p, column[used])
-                slope = coo_matrix(entries, (N * C, len(after))).tocsr()
-                pull += slope.T @ np.asarray(lin.score).ravel()
-                total += slope.T @ slope.multiply(np.asarray(lin.weight).reshape(-1, 1))
-            blocks = np.asarray(total[at[0].ravel(), at[1].ravel()]).reshape(at[0].shape)
-            information = blocks + np.eye(own.shape[1])
+                on = np.flatnonzero((node[np.asarray(read)] >= 0).any(1))
+                read, slope, weight, score = (np.asarray(x)[on] for x in (read, lin.bias, lin.weight, lin.score))
+                np.add.at(pull, read, np.sum(score[:, :, None] * slope, 1))
+                values = np.einsum("nc,nca,ncb->nab", weight, slope, slope)
+                i, j = np.broadcast_arrays(read[:, :, None], read[:, None, :])
+                both = (node[i] >= 0) & (node[i] == node[j])
+                np.add.at(blocks, (node[i[both]], column[i[both]], column[j[both]]), values[both])
+            information, pull[-1] = blocks, 0.0
             change = np.nan_to_num(solve_square(information, pull[own][:, :, None])[:, :, 0])
             after[own] += change * STRIDE / np.maximum(np.abs(change).max(1, keepdims=True), STRIDE)
         return after[:-1], information
