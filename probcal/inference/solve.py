@@ -215,7 +215,9 @@ def _beside_mirrors(answer: Answer, method: Maximiser, context: Context) -> Answ
             known = [mode.point for mode, one in found if one is not None]
             if new(problem, own.posterior.point, known, reach(problem, other.point, here)):
                 place, gain = own.posterior, _weight(own) - first
-                found.append((Mirrored(other.name, gain, place.point, place.summary.mean, other.kind, str(own.status)), own))
+                found.append(
+                    (Mirrored(other.name, gain, place.point, place.summary.mean, other.kind, str(own.status)), own)
+                )
     way, best = alone, answer
     for mode, one in found:
         if one is not None and one.status.settled >= answer.status.settled and mode.gain > max(way.gain, MORE):
