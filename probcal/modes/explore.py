@@ -1,7 +1,8 @@
-"""All modes of a posterior near one: candidates proposed, screened, polished, compared and ranked by evidence.
+"""All modes of a posterior near one: proposed, screened, polished, compared and ranked by evidence.
 
-A proposal is a function of the problem and a point that yields candidates: other configurations of nodes and tracks
-that the data hardly tell from that one, those first that fit best. All else is done here, by one rule each.
+A proposal is a function of the problem and a point that yields candidates: other configurations of
+nodes and tracks that the data hardly tell from that one, those first that fit best. All else is done
+here, by one rule each.
 """
 
 from collections import Counter
@@ -25,24 +26,26 @@ from probcal.modes.reflections import SHIFTED, place_biases
 from probcal.priors import Precision
 from probcal.problem import Problem
 
-WORSE = (
-    0.4  # nats a datum by which an unpolished candidate may fit worse and is still polished: 0 to 0.2 beside a mirror,
-)
-# 0.9 to 5 in networks without one (models/, share 0.3)
-TRIED = 8  # candidates of a proposal that are climbed from and are another mode, and of those that come back
+# nats a datum by which an unpolished candidate may fit worse and is still polished: 0 to 0.2 beside
+# a mirror, 0.9 to 5 in networks without one (models/, share 0.3)
+WORSE = 0.4
+TRIED = 8  # candidates of a proposal that are climbed from to another mode, and that come back
 MOVES, ROUNDS = 40, 5  # moves of nodes and pieces, and of scenes
-GAIN, MORE = 1.0, 0.1  # nats from which a node or a piece belongs elsewhere, and from which a scene does
-SAME, NEAR = 3.0, 10.0  # nats within which another answer is as good, and within which it is mentioned
+GAIN = 1.0  # nats from which a node or a piece of a track belongs elsewhere
+MORE = 0.1  # nats from which a whole scene does
+SAME = 3.0  # nats within which another answer is as good
+NEAR = 10.0  # nats within which it is mentioned
 MOST = 4  # answers that are kept
 CLIMB = 60  # steps of a climb by an engine
-HELD = 30.0  # nats that a node may fit worse on its other side, tracks held, where each trial is such a climb
+# nats that a node may fit worse on its other side, tracks held, where each trial is such a climb
+HELD = 30.0
 FAINT = 0.03  # share of the extent of the tracks, of which a part (`new`) is no other place
 APART = 0.1  # share of a reflection that must be left after polishing: below, it came back
 PIECES = "pieces of tracks on their other side"
 
 
 class Candidate(NamedTuple):
-    """Another configuration that may fit as well: what was moved, its kind, and the point before it is polished."""
+    """Another configuration that may fit as well: name, kind, and the point before it is polished."""
 
     name: str
     kind: str  # of `labels`: a scene, a piece of a track, a node
@@ -110,10 +113,10 @@ class Sides(NamedTuple):
 
 
 def explore(problem: Problem, point: Point, climb: SideClimb, proposals: Sequence[Proposal]) -> Sides:
-    """The best mode that proposals lead to from a point, one after the other, and those of about the same evidence.
+    """The best mode that proposals lead to from a point, and those of about the same evidence.
 
-    A node or a piece of a track that fits better elsewhere is moved at once. Whole scenes, and what fits about as well,
-    are weighed by their evidence; the search goes on from the best of them.
+    A node or a piece of a track that fits better elsewhere is moved at once. Whole scenes, and
+    candidates that fit about as well, are weighed by their evidence; the search goes on from the best.
     """
     given = here = _Here(problem, climb, point)
     way: tuple[str, str] | None = None
@@ -136,7 +139,7 @@ def explore(problem: Problem, point: Point, climb: SideClimb, proposals: Sequenc
 
 @dataclass(frozen=True)
 class _Here:
-    """The point where a search stands; its mode is looked for where there are candidates to compare with it."""
+    """The point where a search stands; its mode is found when a candidate is compared with it."""
 
     problem: Problem
     climb: SideClimb
@@ -153,14 +156,14 @@ class _Here:
 
 
 class Gap(NamedTuple):
-    """What lies between two points: root sums of squares, over all places of targets and over those of nodes."""
+    """Root sums of squares between two points, over all places of targets and over those of nodes."""
 
     tracks: float  # m
     nodes: float  # in declared scales
 
 
 class _Tried(NamedTuple):
-    """A candidate with the mode that it leads to, and what lies between it and the mode of the point."""
+    """A candidate with the mode that it leads to, and its distance from the mode of the point."""
 
     candidate: Candidate
     mode: tuple[Point, float]
@@ -169,7 +172,7 @@ class _Tried(NamedTuple):
 
 
 def _moved(here: _Here, proposals: Sequence[Proposal]) -> tuple[_Here, tuple[str, str] | None, list[_Tried]]:
-    """Where no proposal leads to a better node or piece any more; the name and kind of the way there.
+    """The point from which no proposal leads to a better node or piece; name and kind of the last move.
 
     Also what fits about as well there, that of the last proposal first.
     """
@@ -189,7 +192,7 @@ def _moved(here: _Here, proposals: Sequence[Proposal]) -> tuple[_Here, tuple[str
 
 
 def _looked(here: _Here, proposal: Proposal) -> tuple[_Tried | None, list[_Tried]]:
-    """The first node or piece that fits better than the mode here, None without any, and what fits about as well."""
+    """The first node or piece that fits better than the mode here, and all that fit about as well."""
     found, count = list[_Tried](), Counter[bool]()
     for candidate in proposal(here.problem, here.point, here.climb.most):
         if TRIED in count.values():
@@ -209,7 +212,10 @@ def _looked(here: _Here, proposal: Proposal) -> tuple[_Tried | None, list[_Tried
 
 
 def _tried(here: _Here, candidate: Candidate) -> _Tried | None:
-    """A candidate polished; None where its tracks come back by themselves. A node may leave them on another side."""
+    """A candidate polished; None where its tracks come back by themselves.
+
+    A node may come back and leave tracks on another side.
+    """
     problem, best, start = here.problem, here.mode[0], candidate.point
     size = reach(problem, start, best)
     if candidate.kind == NODE:
@@ -227,7 +233,7 @@ def _tried(here: _Here, candidate: Candidate) -> _Tried | None:
 
 
 def _ranked(here: _Here, near: Sequence[_Tried]) -> list[Mirrored]:
-    """Each mode once, with its evidence less that of the mode here: those within `NEAR` nats of it, the best first."""
+    """Each mode within `NEAR` nats once, with its evidence less that of the mode here, best first."""
     found = list[Mirrored]()
     for (name, kind, _), mode, size, _ in near:
         if new(here.problem, mode[0], [other.point for other in found], size):
@@ -246,14 +252,14 @@ def distance(problem: Problem, a: Point, b: Point) -> Gap:
 
 
 def reach(problem: Problem, a: Point, b: Point) -> Gap:
-    """What lies between two answers, so much at least that a part of it (`new`) is another place."""
+    """The distance of two answers, at least `FAINT` of the extent of the tracks."""
     gap, places = distance(problem, a, b), problem.positions(b.states)
     extent = float(np.sqrt(sum(np.sum((own - own.mean(0)) ** 2) for own in places)))
     return gap._replace(tracks=max(gap.tracks, FAINT * extent))
 
 
 def new(problem: Problem, point: Point, known: Sequence[Point], size: Gap) -> bool:
-    """Whether a point lies apart from all that are known, by a good part of the size of a reflection."""
+    """Whether a point lies apart from all known ones by a fraction of the size of a reflection."""
     gaps = [distance(problem, point, other) for other in known]
     nodes = size.nodes if size.nodes > SHIFTED else np.inf
     tracks = size.tracks if size.tracks > 0 else np.inf

@@ -1,4 +1,4 @@
-"""The straight path at constant speed that fits one sensor's directions best, in units of its first range."""
+"""The straight path at constant speed that fits one sensor's directions best, up to scale."""
 
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ STEEP = 1e-6  # cosine of the elevation below which the azimuth has no meaning
 
 
 class StraightTrack(NamedTuple):
-    """First place and velocity (2 d,) with their covariance (2 d, 2 d), the first range one; `cost` as half a sum."""
+    """First place and velocity (2 d,) with their covariance (2 d, 2 d), in units of the first range."""
 
     time: np.ndarray
     state: np.ndarray
@@ -78,7 +78,7 @@ def _along(t: np.ndarray, n: int) -> np.ndarray:
 
 
 def _basis(x: np.ndarray) -> np.ndarray:
-    """Orthogonal unit vectors (2 d, 2 d), the first along a path: what directions do not tell is its size."""
+    """Orthogonal unit vectors (2 d, 2 d), the first along a path."""
     axes = singular(x[None], whole=True)[2]
     return axes * np.where(np.arange(len(x)) == 0, np.sign(axes[0] @ x), 1.0)[:, None]
 
