@@ -6,11 +6,10 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
-import xarray as xr
 
 from probcal.fingerprint import computes
 from probcal.inference.identity import add_array, setting_text
@@ -20,6 +19,9 @@ from probcal.network import Network, Node
 from probcal.noise import Heard, at_guess, guess_of
 from probcal.sensor import Channel, Sensor, SensorType
 from probcal.types import float64
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 STEPS = (0.3, 7.0)  # s, two unlike steps at which the linear form of a motion is compared
 
