@@ -27,7 +27,7 @@ class ModeRow(NamedTuple):
     gain: float = np.nan  # evidence or log density less that of the reported one, nats
     status: str = ""  # of the fit from there; empty where it was found only
     start: int = -1  # number of the start that led to it
-    objective: float = np.nan  # evidence or log density itself, where a start led to it
+    objective: float = np.nan  # evidence or log density itself; NaN where no start led to it
 
 
 def apart(bias: np.ndarray, other: np.ndarray, sd: np.ndarray) -> np.ndarray:
