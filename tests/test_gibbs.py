@@ -19,7 +19,7 @@ from probcal.gaussian.dense import DenseEngine
 from probcal.gaussian.mode import Point, driven_states, log_density
 from probcal.geometry import norm
 from probcal.inference import calibrate
-from probcal.inference.joint_gibbs import Gibbs, _Sweeps
+from probcal.inference.joint_gibbs import Gibbs, GibbsChains
 from probcal.inference.method import Context
 from probcal.inference.noise_step import draw_noise, levels_alone
 from probcal.inference.solve import solve
@@ -239,13 +239,13 @@ def test_more_sweeps_a_draw_begin_the_sums_anew():
     problem = drawn()[0]
     with jax.enable_x64(True):
         runs = chains_of(problem, Gibbs(**SHORT))
-        state = runs.first()
-        state, _ = runs.advance(state, 1, None)
+        state = runs.init()
+        state, _ = runs.advance(state, 1)
         assert state.summed.tolist() == [0, 0], "the first 25 are warm-up"
-        state, first = runs.advance(state, 1, None)
+        state, first = runs.advance(state, 1)
         assert state.summed.tolist() == [2 * 25, 0]
         kept = state.total[0]
-        state, draws = runs.advance(state, 2, None)
+        state, draws = runs.advance(state, 2)
         assert (state.summed.tolist(), int(state.made)) == ([2 * 50, 2 * 25], 100)
         np.testing.assert_array_equal(state.total[1], kept)
         assert np.shape(draws.theta) == (2, 25, problem.model.biases)
@@ -253,18 +253,8 @@ def test_more_sweeps_a_draw_begin_the_sums_anew():
 
 
 def chains_of(problem, method):
-    from probcal.gaussian.choose import direct_engine
-    from probcal.gaussian.climb import climb_to_mode
-    from probcal.gaussian.engine import Factors
-    from probcal.inference.hierarchy import hierarchy_of
-    from probcal.inference.posed import Form
-
-    prior = pc.Horseshoe()
-    engine, factors = direct_engine(), Factors.alone(np.ones(problem.model.biases))
-    mode = climb_to_mode(lambda at: engine.settled(problem.model, at), automatic_start(problem), factors, 60, 1e-3).at
-    form = Form(problem.model.biases, hierarchy_of(prior, problem))
-    first = prior.precision(problem.labels, problem.surveyed)
-    return _Sweeps(method, form, first, engine, mode, jax.random.key(0))
+    context = Context(jax.random.key(0))
+    return GibbsChains(method, problem, pc.Horseshoe(), automatic_start(problem), context)
 
 
 @pytest.mark.slow

@@ -40,6 +40,7 @@ from probcal.gaussian.mode import _proposal, eliminate, find_mode
 from probcal.geometry import bearing, norm
 from probcal.inference.ending import conclude, misfit_sentence
 from probcal.inference.fit import calibrate
+from probcal.inference.loop import Trace
 from probcal.inference.method import Context
 from probcal.inference.run import first_state, given_of
 from probcal.misfit import MisfitData, misfit_text
@@ -335,11 +336,11 @@ def test_an_evidence_below_its_best_or_a_step_never_taken_is_no_answer():
         state = start._replace(
             found=found, worth=found.evidence, best=found.evidence + 5.0, refused=jnp.zeros((), bool)
         )
-        state = state._replace(done=jnp.ones((), bool))
-        fallen = conclude(problem, EA(), ARD(), state, np.zeros(3), 1.0, 3)
-        held = conclude(problem, MAP(), Gaussian(), state, np.zeros(3), 1.0, 3)  # nothing is learnt: no objective
+        state, course = state._replace(done=jnp.ones((), bool)), Trace(*np.zeros((3, 3)))
+        fallen = conclude(problem, EA(), ARD(), state, course)
+        held = conclude(problem, MAP(), Gaussian(), state, course)  # nothing is learnt: no objective
         state = state._replace(done=jnp.zeros((), bool), refused=jnp.ones((), bool))
-        stuck = conclude(problem, MAP(), Gaussian(), state, np.zeros(3), 1.0, 3)
+        stuck = conclude(problem, MAP(), Gaussian(), state, course)
     assert fallen.status == "not converged"
     assert "The evidence fell by 5 nats below its best on the way" in fallen.message
     assert held.status == "converged"

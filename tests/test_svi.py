@@ -10,10 +10,9 @@ from worlds import linear, resting, small
 from probcal import NUTS, SVI, Gaussian, Horseshoe, InputError
 from probcal.gaussian.mode import smooth_tracks
 from probcal.inference.guides import GuideParameters, Structured
+from probcal.inference.method import Context
 from probcal.inference.pose import pareto_khat
 from probcal.inference.posterior import facts_of_steps
-from probcal.inference.progress import Monitor
-from probcal.inference.sampling import sample
 from probcal.modes import automatic_start
 from probcal.status import CHAINS, judge
 
@@ -49,12 +48,18 @@ def test_pareto_khat_is_that_of_the_large_weights():
     assert pareto_khat(np.zeros(100)) == 0.0
 
 
+def sample(problem, method, prior, start, seed):
+    """The draws of a sampler, and how the run went."""
+    context = Context(jax.random.key(seed))
+    task = method.task(problem, prior, start, context)
+    return task.run(context.run(task)[1])
+
+
 def solved(name, method, prior):
     """A linear case by a method, and its exact posterior."""
     problem, naive = linear(name)
     start = smooth_tracks(problem.model, resting(problem))
-    run = sample(problem, method, prior, start, jax.random.key(4), monitor=Monitor())
-    return run, reference.dense(naive, np.ones(len(naive.labels)))
+    return sample(problem, method, prior, start, 4), reference.dense(naive, np.ones(len(naive.labels)))
 
 
 def test_linear_problems_are_exact():
@@ -85,10 +90,8 @@ def test_a_guide_that_does_not_fit_has_not_converged(khat, status, monkeypatch):
 def test_determined_biases_have_the_sds_of_nuts():
     problem = small(scans=20)
     start = automatic_start(problem)
-    exact = sample(
-        problem, NUTS(chains=2, warmup=200, draws=400), Horseshoe(), start, jax.random.key(0), monitor=Monitor()
-    )
-    found = sample(problem, SVI(chains=2), Horseshoe(), start, jax.random.key(1), monitor=Monitor())
+    exact = sample(problem, NUTS(chains=2, warmup=200, draws=400), Horseshoe(), start, 0)
+    found = sample(problem, SVI(chains=2), Horseshoe(), start, 1)
     determined = exact.draws.gamma.mean((0, 1)) > 0.5
     assert determined.sum() >= 2
     sd = exact.z.std((0, 1))

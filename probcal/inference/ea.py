@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import InitVar, dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeGuard
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from probcal.inference.method import Context, Given, State
 from probcal.inference.posed import Form
 from probcal.inference.pruned import without_far_modes
 from probcal.inference.relevance import best_precisions
-from probcal.inference.run import Maximiser, course_of, first_precision, given_of, learn, renew_noise, valued
+from probcal.inference.run import KernelClimb, Maximiser, course_of, first_precision, learn, renew_noise, valued
 from probcal.model.model import Mixing, Model
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem
@@ -167,29 +167,30 @@ class EA(Maximiser):
         """Any hierarchical prior where precisions are integrated, else ARD."""
         return prior.hierarchical if self.precisions == "integrated" else isinstance(prior, ARD)
 
-    def climb(
-        self, problem: Problem, prior: Prior, start: Point, context: Context, alpha: np.ndarray | None = None
-    ) -> tuple[State, Trace]:
-        """The outer loop; where precisions are maximised, again without biases that another mode keeps in."""
-        state, trace = super().climb(problem, prior, start, context, alpha)
-        if alpha is not None or self.trajectory != "marginal" or not isinstance(prior, ARD) or self.integrates(prior):
-            return state, trace
+    def further(self, task: KernelClimb, state: State, course: Trace) -> tuple[State, Trace]:
+        """Where precisions are maximised, the state of climbs again, without biases that another mode keeps in."""
+        problem, prior, context = task.problem, task.prior, task.context
+        if task.alpha is not None or not self._tries_again(prior):
+            return state, course
         if (prior.shape, prior.rate, prior.by) == (1.0, 0.0, None):
-            state, trace = self._climbed_again(problem, prior, state, trace, context)
+            state, course = self._climbed_again(problem, prior, state, course, context)
         if prior.correlation:
-            return state, trace
+            return state, course
 
         def climb(point: Point, alpha: np.ndarray, mixing: Mixing) -> State:
             return self.climb(problem.with_mixing(mixing), prior, point, context, alpha)[0]
 
-        kept = without_far_modes(problem.model, prior, given_of(self, problem, prior), state, climb)
+        kept = without_far_modes(problem.model, prior, task.given, state, climb)
         last = jax.tree.map(lambda leaf: np.asarray(leaf)[None], course_of(kept))
-        return kept, trace if kept is state else trace.and_then(last)
+        return kept, course if kept is state else course.and_then(last)
+
+    def _tries_again(self, prior: Prior) -> TypeGuard[ARD]:
+        """Whether maximised precisions are tried anew after a climb."""
+        return self.trajectory == "marginal" and isinstance(prior, ARD) and not self.integrates(prior)
 
     def climbs_once(self, problem: Problem, prior: Prior) -> bool:
         """Not where maximised precisions are tried anew after a climb."""
-        again = self.trajectory == "marginal" and isinstance(prior, ARD) and not self.integrates(prior)
-        return super().climbs_once(problem, prior) and not again
+        return super().climbs_once(problem, prior) and not self._tries_again(prior)
 
     def _climbed_again(
         self, problem: Problem, prior: Prior, state: State, trace: Trace, context: Context

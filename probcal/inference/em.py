@@ -11,12 +11,11 @@ from probcal.gaussian.esteps import EStep, Extended, shorten
 from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import Point, cost, mixing_gain
 from probcal.gaussian.solves import Dense
-from probcal.inference.method import Context, Given, ParticleSmoother, State
+from probcal.inference.method import Context, Given, MethodTask, ParticleSmoother, State
 from probcal.inference.run import Maximiser, learn, renew_noise, valued
 from probcal.model.model import Model
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Precision, Prior
 from probcal.problem import Problem
-from probcal.results.answer import Answer
 
 EXTENDED = Extended()
 BY_PATHS = "Gaussian of the curvature of the marginal likelihood, by the slope of its score over filters"
@@ -100,11 +99,11 @@ class EM(Maximiser):
         """What the intervals are worth."""
         return BY_PATHS if self.by_particles and not prior.learns else super().note(prior)
 
-    def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
-        """Climb from a start until it is done or its iterations are spent."""
+    def task(self, problem: Problem, prior: Prior, start: Point, context: Context) -> MethodTask:
+        """A climb, by particles where the E-step draws them."""
         if isinstance(self.e_step, ParticleSmoother):
-            return self.e_step.climbed(problem, self, prior, start, context)
-        return super().answer(problem, prior, start, context)
+            return self.e_step.task(self, problem, prior, start, context)
+        return super().task(problem, prior, start, context)
 
     def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """Inner EM steps, then new precisions."""

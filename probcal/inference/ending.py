@@ -11,9 +11,10 @@ from probcal.errors import FitError
 from probcal.gaussian.choose import choose
 from probcal.gaussian.draws import residuals
 from probcal.gaussian.engine import Expansion, Factors
-from probcal.gaussian.information import growing_square, rejected, squares_of
+from probcal.gaussian.information import growing_square, mean_square, rejected, squares_of
 from probcal.gaussian.mode import Point
 from probcal.inference.integrate import Integrated, Integration
+from probcal.inference.loop import Trace
 from probcal.inference.method import Iterated, State
 from probcal.inference.mixture import gaussian, mixture
 from probcal.labels import listed
@@ -43,14 +44,12 @@ def conclude(
     method: Iterated,
     prior: Prior,
     state: State,
-    trace: np.ndarray,
-    square: float,
-    iterations: int,
+    course: Trace,
     how: Integration | None = None,
     mixed: Integrated | None = None,
     stopped: str = "",
 ) -> Answer:
-    """The answer of a method whose outer loop ended in a state, whose data leave a mean square a datum.
+    """The answer of a method whose outer loop ended in a state after a course.
 
     Where precisions were integrated after it, `mixed` is what came of it; `stopped` says why it was
     ended early.
@@ -63,9 +62,9 @@ def conclude(
         alpha = np.asarray(prior.precision(problem.labels, problem.surveyed).alpha)
         posterior = mixture(problem, prior, how.form, alpha, mixed, worth)
     answer = conclude_at(
-        problem, method, prior, posterior, trace, square, iterations,
+        problem, method, prior, posterior, course, evidence=worth, stopped=stopped,
         converged=bool(state.done) and (mixed is None or bool(mixed.settled)), refused=bool(state.refused),
-        evidence=worth, lost=fallen(prior, len(problem.levels), state.best, state.worth), stopped=stopped,
+        lost=fallen(prior, len(problem.levels), state.best, state.worth),
     )  # fmt: skip
     said = uncertain(problem.labels, mixed) if mixed is not None and answer.status.valid else ""
     return answer.noted(said)
@@ -103,15 +102,14 @@ def uncertain(labels: Sequence[str], mixed: Integrated) -> str:
 
 
 def conclude_at(
-    problem: Problem, method: Iterated, prior: Prior, posterior: Posterior, trace: np.ndarray, square: float,
-    iterations: int, *, converged: bool, evidence: float, lost: float = 0.0, stopped: str = "",
-    **others: Any,
+    problem: Problem, method: Iterated, prior: Prior, posterior: Posterior, course: Trace, *, converged: bool,
+    evidence: float, lost: float = 0.0, stopped: str = "", **others: Any,
 ) -> Answer:  # fmt: skip
     """The answer of a climb that ended at a posterior: whether it converged, never left its start, lost evidence.
 
     `others` are further facts that `probcal.status.CLIMB` knows, or the same otherwise.
     """
-    point, summary = posterior.point, posterior.summary
+    summary, trace, iterations = posterior.summary, course.objective, course.iterations
     low, far = low_and_far(prior, summary, problem.surveyed)
     cut = bool(stopped) and not converged and iterations < method.iterations
     asked = method.tolerance == 0.0 and not cut  # to run so many iterations, whatever they reach
@@ -130,12 +128,14 @@ def conclude_at(
         "spent": asked, **others,
     }  # fmt: skip
     if "misfit" not in others:
-        facts["misfit"] = misfit_sentence(problem, point, square)
+        facts["misfit"] = misfit_sentence(problem, posterior.point)
     status, message = judge(CLIMB, facts)
     pruned = (summary.gamma < 1e-2) & (summary.precisions == "maximised")
     ended = bias_status(problem, {"at bound": low, "diverged": far, "pruned": pruned})
     message = " ".join(part for part in (message, method.remark(prior)) if part)
-    return Answer(problem, method, method, prior, posterior, status, message, ended, iterations, trace, interrupted=cut)
+    return Answer(
+        problem, method, method, prior, posterior, status, message, ended, iterations, *course, interrupted=cut,
+    )  # fmt: skip
 
 
 def bias_status(problem: Problem, masks: Mapping[str, np.ndarray]) -> tuple[str, ...]:
@@ -165,12 +165,13 @@ def fallen(prior: Prior, levels: int, best: Any, worth: Any) -> float:
     return max(float(best) - float(worth), 0.0) if prior.proper and (prior.learns or levels) else 0.0
 
 
-def misfit_sentence(problem: Problem, point: Point, square: float) -> str:
+def misfit_sentence(problem: Problem, point: Point, square: float | None = None) -> str:
     """The misfit of a point whose residuals have this mean square, its likely cause and what to do.
 
     Empty where the point explains the data, and robust noise rejects no sensor. A std that grows hides a
     misfit: then the automatic start is compared.
     """
+    square = float(mean_square(problem.model, point)) if square is None else square
     grown = growing_square(problem.model, point)
     if square <= ABSURD and grown > DOUBTED and choose(problem.model).cheap and not _drawn(problem):
         least = growing_square(problem.model, automatic_start(problem))

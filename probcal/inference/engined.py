@@ -13,69 +13,21 @@ import numpy as np
 
 from probcal.errors import FitError
 from probcal.gaussian.climb import climb_to_mode
-from probcal.gaussian.engine import Engine, Estimate, Expansion, Factors, evidence
-from probcal.gaussian.information import mean_square
+from probcal.gaussian.engine import Engine, Expansion, Factors, evidence
 from probcal.gaussian.mode import Point
 from probcal.gaussian.search import Search
 from probcal.gaussian.tails import Variances, renewed_noise
 from probcal.inference.ending import conclude_at, diverged, fallen
 from probcal.inference.integrate import by_propagation
-from probcal.inference.loop import Pause, Task, Trace
-from probcal.inference.method import Context
-from probcal.inference.mixture import gaussian, mixture
+from probcal.inference.loop import Pause, Trace
+from probcal.inference.method import Context, MethodTask
+from probcal.inference.mixture import gaussian_at, mixture
 from probcal.inference.placed import Reached, with_places
 from probcal.model.model import Mixing, Model
 from probcal.modes.explore import CLIMB
 from probcal.priors import Flat, Gaussian, Precision, Prior
 from probcal.problem import Problem
-from probcal.results.answer import Answer, Posterior, blocks_under, tracks_at
-from probcal.results.schema import ROPE
-
-
-def climb_on(engine: Engine, method: Any, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
-    """The answer of a climb from the host to the marginal or joint mode, on any engine.
-
-    Raises `FitError` where a flat prior leaves no interval, and where memory does not hold it.
-    """
-    model, first = problem.model, prior.precision(problem.labels, problem.surveyed)
-    scales = method.climbs_under(prior).precision(problem.labels, problem.surveyed)
-    factors, how = Factors.of(scales), method.integration(problem, prior)
-    marginal = method.integrates_places
-
-    def climb(problem: Problem, start: Point) -> Reached:
-        own = method.name, method.iterations, method.tolerance
-        task = HostClimb.of(*own, engine, problem.model, start, scales, factors, marginal)
-        state, trace = context.run(task)
-        at, trace = task.reached(state, trace)
-        return Reached(problem.with_mixing(state.mixing), at, factors, float(trace.objective[-1]), (state, trace))
-
-    try:
-        end, settled = climb(problem, start), True
-        if model.rests and marginal:
-            end, settled = with_places(climb, end, engine, lambda: context.monitor.stopped)
-        problem, at, (state, trace) = end.problem, end.at, end.state
-        worth = evidence(at, scales, factors)
-        if how is None:
-            posterior = _normal(problem, prior, at, first, worth)
-        else:
-            mixed, work = by_propagation(how.form, first, engine, at, context, marginal=marginal)
-            posterior = mixture(problem, prior, how.form, first.alpha, mixed, worth.value, work)
-            settled = settled and bool(mixed.settled)
-    except MemoryError:
-        if not (engine.exact and method.engine == "auto" and isinstance(prior, (Gaussian, Flat))):
-            raise _memory(engine, model) from None
-        other = replace(method, engine="iterative")
-        return cast("Answer", other.answer(problem, prior, start, context))
-    except np.linalg.LinAlgError:
-        raise diverged(problem, engine.at(model, start), factors) from None
-    square = float(mean_square(problem.model, posterior.point))
-    worths, count = trace.objective, trace.iterations
-    lost = fallen(prior, len(problem.levels), worths.max(), worths[-1]) if model.learns_noise else 0.0
-    found = conclude_at(
-        problem, method, prior, posterior, worths, square, count, refused=bool(state.refused), lost=lost,
-        converged=bool(state.converged) and settled, evidence=worth.value, stopped=context.monitor.stopped,
-    )  # fmt: skip
-    return replace(found, steps=trace.z, precisions=trace.alpha)
+from probcal.results.answer import Answer
 
 
 class HostState(NamedTuple):
@@ -92,32 +44,37 @@ class HostState(NamedTuple):
 
 
 @dataclass(eq=False)
-class HostClimb(Task):
+class HostClimb(MethodTask):
     """Climbs in turn to the mode of the biases and, where noise is not known, to that of largest evidence.
 
     An iteration is a step of the biases where noise is known, else a turn; it ends where a turn moves the evidence by
-    less than the tolerance.
+    less than the tolerance. Its iterations are steps, and the start.
     """
 
-    tolerance: float
-    most: int  # steps of a turn
     engine: Engine
-    model: Model
-    start: Point
-    prior: Precision
+    scales: Precision  # of the climb
     factors: Factors  # of the prior
-    marginal: bool
+    turns: int
+    tolerance: float
+    marginal: bool = True
     here: Expansion | None = None  # at the point of the last state
+
+    def __post_init__(self) -> None:
+        self.model, self.most = self.problem.model, min(CLIMB, self.turns)
 
     @classmethod
     def of(
-        cls, name: str, turns: int, tolerance: float, engine: Engine, model: Model, start: Point, prior: Precision,
-        factors: Factors, marginal: bool = True,
-    ) -> HostClimb:  # fmt: skip
-        """The climb of a method in this many turns at most; its iterations are steps, and the start, without them."""
-        most = min(CLIMB, turns)
-        iterations = turns if model.learns_noise else most + 1
-        return cls(name, iterations, model.biases, tolerance, most, engine, model, start, prior, factors, marginal)
+        cls, method: Any, problem: Problem, prior: Prior, start: Point, context: Context, engine: Engine
+    ) -> HostClimb:
+        """The climb of a method that reports a Gaussian, or a mixture, at the mode."""
+        scales = method.climbs_under(prior).precision(problem.labels, problem.surveyed)
+        own = method.iterations, method.tolerance, method.integrates_places
+        return cls(method, problem, prior, start, context, engine, scales, Factors.of(scales), *own)
+
+    @property
+    def iterations(self) -> int:
+        """Turns, or steps and the start."""
+        return self.turns if self.model.learns_noise else self.most + 1
 
     def init(self) -> HostState:
         """The state before the first turn."""
@@ -150,29 +107,69 @@ class HostClimb(Task):
         done = over and not model.learns_noise
         after = HostState(mode.at.point, model.mixing, search, over, state.worth, converged, refused, done)
         if not model.learns_noise:
-            return after, self.course(mode.trace, mode.places)
+            return after, self.course_at(mode.trace, mode.places)
         if not over:
-            return after, self.course([], mode.places[:0])
-        worth = evidence(mode.at, self.prior, self.factors).value
+            return after, self.course_at([], mode.places[:0])
+        worth = evidence(mode.at, self.scales, self.factors).value
         still = abs(worth - float(state.worth)) < self.tolerance
         after = after._replace(worth=worth, converged=converged and still, done=still or not np.isfinite(worth))
-        return after, self.course([worth], mode.places[-1:])
+        return after, self.course_at([worth], mode.places[-1:])
 
-    def course(self, worth: Any, z: np.ndarray) -> Trace:
+    def course_at(self, worth: Any, z: np.ndarray) -> Trace:
         """The course of iterations that end at biases z (I, M), whose precisions are given."""
-        return Trace(np.asarray(worth, float), z, np.broadcast_to(np.asarray(self.prior.alpha), z.shape))
+        return Trace(np.asarray(worth, float), z, np.broadcast_to(np.asarray(self.scales.alpha), z.shape))
 
     def ended(self, state: HostState, trace: Trace) -> bool:
         """True where the mode is reached, and the noise stays as it is."""
         return bool(state.done)
 
-    def reached(self, state: HostState, trace: Trace) -> tuple[Expansion, Trace]:
-        """The posterior at the end, and the course up to there where it was stopped within a turn."""
-        at = self.at(state)
-        if state.over or not self.model.learns_noise:
-            return at, trace
-        worth = evidence(at, self.prior, self.factors).value
-        return at, trace.and_then(self.course([worth], np.asarray(at.point.z)[None]))
+    def reached(self, state: HostState, trace: Trace) -> Reached:
+        """The end of the climb, with the course up to there where it was stopped within a turn."""
+        at, problem = self.at(state), self.problem.with_mixing(state.mixing)
+        if self.model.learns_noise and not state.over:
+            worth = evidence(at, self.scales, self.factors).value
+            trace = trace.and_then(self.course_at([worth], np.asarray(at.point.z)[None]))
+        return Reached(problem, at, self.factors, float(trace.objective[-1]), (state, trace))
+
+    def outcome(self, state: HostState, course: Trace) -> Answer:
+        """The Gaussian at the mode, or the mixture where precisions are integrated.
+
+        Places that are far from Gaussian are integrated there, and it climbs again with what they add.
+        """
+        method, prior, context, engine = self.method, self.prior, self.context, self.engine
+
+        def climb(problem: Problem, start: Point) -> Reached:
+            task = replace(self, problem=problem, start=start, here=None)
+            return task.reached(*context.run(task))
+
+        end, settled = self.reached(state, course), True
+        if self.model.rests and self.marginal:
+            end, settled = with_places(climb, end, engine, lambda: context.monitor.stopped)
+        problem, at, (state, course) = end.problem, end.at, end.state
+        first, how = prior.precision(problem.labels, problem.surveyed), method.integration(problem, prior)
+        worth = evidence(at, self.scales, self.factors)
+        if how is None:
+            posterior = gaussian_at(problem, prior, at, worth)
+        else:
+            mixed, work = by_propagation(how.form, first, engine, at, context, marginal=self.marginal)
+            posterior = mixture(problem, prior, how.form, first.alpha, mixed, worth.value, work)
+            settled = settled and bool(mixed.settled)
+        worths = course.objective
+        lost = fallen(prior, len(problem.levels), worths.max(), worths[-1]) if self.model.learns_noise else 0.0
+        return conclude_at(
+            problem, method, prior, posterior, course, converged=bool(state.converged) and settled,
+            evidence=worth.value, lost=lost, stopped=context.monitor.stopped, refused=bool(state.refused),
+        )  # fmt: skip
+
+    def recovered(self, error: MemoryError | np.linalg.LinAlgError) -> Answer:
+        """The answer without a factor where memory does not hold one; raises what to do where there is none."""
+        method, engine, prior = self.method, self.engine, self.prior
+        if isinstance(error, np.linalg.LinAlgError):
+            raise diverged(self.problem, engine.at(self.model, self.start), self.factors) from None
+        if not (engine.exact and method.engine == "auto" and isinstance(prior, (Gaussian, Flat))):
+            raise _memory(engine, self.model) from None
+        other = replace(method, engine="iterative")
+        return cast("Answer", other.answer(self.problem, prior, self.start, self.context))
 
 
 def _memory(engine: Engine, model: Model) -> FitError:
@@ -184,18 +181,3 @@ def _memory(engine: Engine, model: Model) -> FitError:
             ' MAP(engine="iterative") makes none; or take fewer sensors or a shorter time'
         )
     return FitError(f"memory does not hold {size}, not even without a factor: take fewer sensors or a shorter time")
-
-
-def _normal(problem: Problem, prior: Prior, at: Expansion, first: Precision, worth: Estimate) -> Posterior:
-    """The Gaussian at a mode under precisions `first`; `worth` is its log evidence."""
-    factors = Factors.of(first)
-    spread = at.spread(factors)
-    blocks = blocks_under(at, factors, spread)
-    declared = blocks if prior.proper else blocks.under_scales()
-    errors = {"sd_error": 0.5 * spread.error / spread.biases} if spread.error.any() else {}
-    numbers = {"log_evidence_error": worth.error} if prior.proper and worth.error else {}
-    return gaussian(
-        problem, prior, at.point, blocks, first.alpha, evidence=worth.value, columns=declared.contraction() | errors,
-        at=at, factors=factors, moments=tracks_at(at.point, spread.states), declared=declared,
-        attrs={"rope": ROPE} | numbers,
-    )  # fmt: skip

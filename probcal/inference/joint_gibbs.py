@@ -8,9 +8,7 @@ size.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
@@ -21,7 +19,7 @@ import numpy as np
 
 from probcal.errors import FitError, InputError
 from probcal.gaussian.choose import choose_fast
-from probcal.gaussian.engine import Engine, Expansion, Factors
+from probcal.gaussian.engine import Factors
 from probcal.gaussian.information import at_levels
 from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.mode import Point, mixed_density
@@ -33,13 +31,13 @@ from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.method import Context
 from probcal.inference.noise_step import draw_noise, levels_alone, log_prior_levels
 from probcal.inference.posed import Form, Natural
-from probcal.inference.posterior import chains, conclude_draws
+from probcal.inference.posterior import SamplerRun, chains, conclude_draws
 from probcal.inference.sampler import Sampler
-from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
+from probcal.inference.sampling import Chains, DrawnChunks
 from probcal.inference.split_hmc import Reference, SplitGaussian, placed, split_variables, variables_of
 from probcal.model.model import Model
 from probcal.modes.explore import CLIMB
-from probcal.priors import Horseshoe, Precision, Prior
+from probcal.priors import Horseshoe, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, Posterior, Tracks, blocks_under
 from probcal.results.blocks import SensorBlocks
@@ -112,34 +110,9 @@ class Gibbs(Sampler):
         " sensors where these do not fit"
     )
 
-    def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
-        """Draws of the posterior from a start, and what they say."""
-        began = time.perf_counter()
-        model, engine = problem.model, choose_fast(problem.model)
-        form = Form(model.biases, hierarchy_of(prior, problem))
-        first = prior.precision(problem.labels, problem.surveyed)
-        factors = Factors.alone(np.ones(model.biases)) if form.hierarchy.learnt else Factors.of(first)
-        try:
-            climb = HostClimb.of(self.name, CLIMB, 1e-3, engine, model, start, first, factors)
-            mode = climb.at(Context(context.key).run(climb)[0])
-            runs = _Sweeps(self, form, first, engine, mode, context.key)
-            drawn, thin, stopped = drawn_by(self, runs, 1, context.monitor, context.storage, context.threads)
-            natural = Natural(jnp.zeros((0, 0)), jnp.zeros(0), model.level_spread, first)
-            seconds = time.perf_counter() - began
-            run = SamplerRun(self, self, form, natural, None, drawn, seconds, stopped, "", (), thin)
-            return conclude_draws(problem, prior, run, partial(gibbs_chains, runs=runs))
-        except MemoryError:
-            raise FitError(
-                f"the factor of {model.state_size} state entries and {model.biases} biases does not fit in"
-                " memory: take fewer sensors or a shorter time"
-            ) from None
-        except np.linalg.LinAlgError:
-            if prior.proper:
-                raise FitError(
-                    "Gibbs: the precision under some draw of the hyper-parameters is singular in double precision:"
-                    " survey or fix what no row tells"
-                ) from None
-            raise diverged(problem, engine.at(model, start), factors) from None
+    def task(self, problem: Problem, prior: Prior, start: Point, context: Context) -> GibbsChains:
+        """Draws of the posterior from a start."""
+        return GibbsChains(self, problem, prior, start, context)
 
     def keeps_states(self, model: Model) -> bool:
         """Whether draws of all states are few enough to be kept."""
@@ -155,17 +128,29 @@ class Gibbs(Sampler):
             )
 
 
-class _Sweeps:
+@dataclass(eq=False)
+class GibbsChains(Chains):
     """All chains, one after the other: a library of sparse factors keeps one at a time, and takes all processors for
     it."""
 
-    def __init__(self, method: Gibbs, form: Form, first: Precision, engine: Engine, mode: Expansion, key: jax.Array):
-        self.method, self.form, self.prior, self.engine = method, form, first, engine
-        self.mode, self.key, self.model = mode, key, mode.model
-        self.alone, self.coupled = levels_alone(mode.model), Factors.coupled(first)
-        self.state: SweepState | None = None  # where the chains stood last
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.model, self.key, self.engine = self.problem.model, self.context.key, choose_fast(self.problem.model)
+        self.form = Form(self.biases, hierarchy_of(self.prior, self.problem))
+        self.first = self.prior.precision(self.problem.labels, self.problem.surveyed)
+        self.posed = Natural(jnp.zeros((0, 0)), jnp.zeros(0), self.model.level_spread, self.first)
+        self.factors = Factors.alone(np.ones(self.biases)) if self.form.hierarchy.learnt else Factors.of(self.first)
+        self.alone, self.coupled = levels_alone(self.model), Factors.coupled(self.first)
         self._reference: Reference | None = None
         self._last: SplitGaussian | None = None
+
+    def init(self) -> SweepState:
+        """Chains about the mode under the declared scales."""
+        own, alone = (self.engine, self.first, self.factors, CLIMB, 1e-3), Context(self.key)
+        climb = HostClimb(self.method, self.problem, self.prior, self.start, alone, *own)
+        self.mode = climb.at(alone.run(climb)[0])
+        self.model = self.mode.model
+        return self.begun()
 
     def _at(self, variables: np.ndarray) -> Reference:
         """The reference at variables (n,), made once."""
@@ -176,17 +161,17 @@ class _Sweeps:
 
     def _given(self, reference: Reference, phi: Phi) -> SplitGaussian:
         """What hyper-parameters leave; factorised once where there are none."""
-        alpha, last = np.asarray(precisions(self.form, phi, self.prior)), self._last
+        alpha, last = np.asarray(precisions(self.form, phi, self.first)), self._last
         if last is None or last.reference is not reference or not np.array_equal(last.alpha, alpha):
             self._last = last = SplitGaussian.of(reference, alpha, self.coupled)
         return last
 
-    def first(self) -> SweepState:
+    def begun(self) -> SweepState:
         """Chains at draws under the declared scales; the reference at the mean of sweeps on the Gaussian."""
         M, begin, C = self.form.biases, self.form.hierarchy.begin, self.method.chains
         key, drawn = jax.random.fold_in(self.key, 1), jax.random.fold_in(self.key, 0)
         reference = self._at(variables_of(self.mode.point.states, self.mode.point.z))
-        scales = np.ones(M) if self.form.hierarchy.learnt else np.asarray(self.prior.alpha)
+        scales = np.ones(M) if self.form.hierarchy.learnt else np.asarray(self.first.alpha)
         wide = SplitGaussian.of(reference, scales, self.coupled)
         at = wide.mean[None] + np.stack([wide.deviation(jax.random.fold_in(drawn, c)) for c in range(C)])
         phis = [begin(jax.random.fold_in(key, c)) for c in range(C)]
@@ -227,16 +212,7 @@ class _Sweeps:
                 break
         return kicks
 
-    def restored(self, leaves: list[np.ndarray]) -> SweepState:
-        """The state of saved leaves; raises `InputError` where they are those of another."""
-        C, n = self.method.chains, self.model.state_size + self.form.biases
-        phi = jax.eval_shape(self.form.hierarchy.begin, self.key)
-        stacked: Any = {name: np.zeros((C, *leaf.shape)) for name, leaf in phi.items()}
-        blank = self._begun(np.zeros((C, n)), stacked, np.zeros(n), 1)
-        self.state = restored_as(blank, leaves)
-        return self.state
-
-    def advance(self, state: SweepState, thin: int, pool: ThreadPoolExecutor) -> tuple[SweepState, Draw]:
+    def advance(self, state: SweepState, thin: int) -> tuple[SweepState, Draw]:
         """All chains one chunk further, every `thin`-th sweep kept."""
         reference, sums = self._at(np.asarray(state.reference)), {name: np.array(getattr(state, name)) for name in SUMS}
         if int(state.thin) != thin:  # begun anew: what was before is warm-up
@@ -256,13 +232,13 @@ class _Sweeps:
                 parts.append(self._draw(own))
             ends.append(own)
             drawn.append(jax.tree.map(lambda *leaves: np.stack(leaves), *parts))
-        self.state = state._replace(
+        after = state._replace(
             at=np.stack([np.append(own.at, own.levels) for own in ends]),
             made=np.array(ends[0].made), thin=np.array(thin),
             phi={name: np.stack([np.asarray(own.phi[name]) for own in ends]) for name in state.phi},
             **sums,
         )  # fmt: skip
-        return self.state, jax.tree.map(lambda *leaves: np.stack(leaves), *drawn)
+        return after, jax.tree.map(lambda *leaves: np.stack(leaves), *drawn)
 
     def _states(self, at: np.ndarray) -> tuple[np.ndarray, ...]:
         """States (E, n) of each recursion; nothing where the draws of all would take too much room."""
@@ -298,10 +274,29 @@ class _Sweeps:
         levels, rest = np.asarray(point.levels), reference.rest(at)[0]
         return chain._replace(at=at, levels=levels, reference=reference, rest=rest)
 
+    def outcome(self, state: SweepState, course: DrawnChunks) -> Answer:
+        """What draws of the biases and sums over sweeps say."""
+        of_run = partial(gibbs_chains, runs=self, state=state)
+        return conclude_draws(self.problem, self.prior, self.run(course), of_run)
+
+    def recovered(self, error: MemoryError | np.linalg.LinAlgError) -> Answer:
+        """Raises what to do without memory for a factor, or where the data leave a bias open."""
+        if isinstance(error, MemoryError):
+            raise FitError(
+                f"the factor of {self.model.state_size} state entries and {self.biases} biases does not fit in"
+                " memory: take fewer sensors or a shorter time"
+            ) from None
+        if self.prior.proper:
+            raise FitError(
+                "Gibbs: the precision under some draw of the hyper-parameters is singular in double precision:"
+                " survey or fix what no row tells"
+            ) from None
+        raise diverged(self.problem, self.engine.at(self.model, self.start), self.factors) from None
+
     def _draw(self, chain: _Chain) -> Draw:
         """What is kept of a chain where it stands."""
         at, z, none = chain.at, chain.at[self.model.state_size :], np.zeros(0)
-        value = chain.reference.log_density(at) + log_prior_of(self.form, chain.phi, self.prior, z)
+        value = chain.reference.log_density(at) + log_prior_of(self.form, chain.phi, self.first, z)
         value += float(jnp.sum(log_prior_levels(self.model, chain.levels)))
         most = NUMBERS / (self.method.chains * self.method.draws)
         phi = {name: np.asarray(leaf) for name, leaf in chain.phi.items() if np.size(leaf) <= most}
@@ -316,11 +311,15 @@ class _Sweeps:
 
 
 def gibbs_chains(
-    problem: Problem, prior: Prior, run: SamplerRun, mixed: Mapping[str, np.ndarray], runs: _Sweeps
+    problem: Problem,
+    prior: Prior,
+    run: SamplerRun,
+    mixed: Mapping[str, np.ndarray],
+    runs: GibbsChains,
+    state: SweepState,
 ) -> Posterior:
     """The posterior of a run of `Gibbs`: the draws of the biases, and moments of the states."""
-    z, model, M, state = run.z, problem.model, run.form.biases, runs.state
-    assert state is not None
+    z, model, M = run.z, problem.model, run.form.biases
     which = 0 if int(state.thin) == run.thin else 1  # a longer run that was interrupted leaves the draws before it
     count, total, square, told, spread = (np.asarray(getattr(state, name))[which] for name in SUMS)
     blocks = SensorBlocks.drawn(z.reshape(-1, M), blocks_of(model), spread / count)

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.errors import InputError
 from probcal.inference.progress import Monitor
 from probcal.inference.storage import Storage
 
@@ -38,58 +38,77 @@ class Trace(NamedTuple):
         return Trace(*(np.concatenate([a, np.asarray(b)]) for a, b in zip(self, other, strict=True)))
 
 
-@dataclass(eq=False)
 class Task(ABC):
-    """Work in outer iterations. A step is a function of the state and of how many iterations are done."""
+    """Work in outer iterations. A step is a function of the state and of how many iterations are done.
 
-    name: str  # of the method, for reports of progress
-    iterations: int  # at most
-    biases: int
+    The course of a task says how many `iterations` it has, its `objective` after each, and goes on by `and_then`.
+    """
+
+    kind: ClassVar[str] = "climb"  # of the storage that keeps it
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """The name of the method, for reports of progress."""
+
+    @property
+    @abstractmethod
+    def iterations(self) -> int:
+        """The most iterations."""
+
+    @property
+    @abstractmethod
+    def biases(self) -> int:
+        """Number of the biases."""
 
     @abstractmethod
     def init(self) -> Any:
         """The state before the first iteration."""
 
     @abstractmethod
-    def step(self, state: Any, count: int, pause: Pause) -> tuple[Any, Trace]:
+    def step(self, state: Any, count: int, pause: Pause) -> tuple[Any, Any]:
         """The state after some iterations, `count` done before, and their course; it returns early on a `pause`."""
 
     @abstractmethod
-    def ended(self, state: Any, trace: Trace) -> bool:
+    def ended(self, state: Any, course: Any) -> bool:
         """True where no further iteration is needed."""
 
+    def course(self, stored: Sequence[Any] = ()) -> Any:
+        """The course that was stored, the empty one where nothing was."""
+        return Trace(*(stored or (np.zeros(0), *np.zeros((2, 0, self.biases)))))
 
-def run(task: Task, monitor: Monitor, storage: Storage | None = None) -> tuple[Any, Trace]:
+    def tell(self, monitor: Monitor, done: int, objective: float) -> None:
+        """Report that some iterations are done."""
+        monitor.tell(self.name, min(done, self.iterations), self.iterations, objective, bound=True)
+
+
+def run(task: Task, monitor: Monitor, storage: Storage | None = None) -> tuple[Any, Any]:
     """Run a task until it has ended, is spent or stopped: its last state and its course.
 
     A storage keeps state and course on the way; what it holds of this loop is gone on with. Of a loop that begins when
     the call is stopped nothing is written, since it is not what an uninterrupted run does.
     """
-    state, moved = task.init(), False
-    trace = Trace(np.zeros(0), *np.zeros((2, 0, task.biases)))
-    kept, late = None if storage is None else storage.checkpoint(arrays_of(state)), bool(monitor.stopped)
-
-    def tell(done: int, objective: float) -> None:
-        monitor.tell(task.name, min(done, task.iterations), task.iterations, objective, bound=True)
+    state, course, moved = task.init(), task.course(), False
+    kept, late = None if storage is None else storage.checkpoint(task.kind, arrays_of(state)), bool(monitor.stopped)
 
     def pause(done: int, objective: float) -> bool:
-        tell(done, objective)
+        task.tell(monitor, done, objective)
         return bool(monitor.stopped) or (kept is not None and not late and kept.due)
 
     if kept is not None and kept.found is not None:
-        state, trace, moved = like(state, kept.found[0]), Trace(*kept.found[1]), True
+        state, course, moved = like(state, kept.found[0]), task.course(kept.found[1]), True
     while True:
-        if done := trace.iterations:
-            tell(done, float(trace.objective[-1]))
-        if done >= task.iterations or task.ended(state, trace) or (moved and monitor.stopped):
+        if done := course.iterations:
+            task.tell(monitor, done, float(course.objective[-1]))
+        if task.ended(state, course) or done >= task.iterations or (moved and monitor.stopped):
             break
-        state, course = task.step(state, done, pause)
-        trace, moved = trace.and_then(course), True
+        state, more = task.step(state, done, pause)
+        course, moved = course.and_then(more), True
         if kept is not None and not late and kept.due:
-            kept.write(arrays_of(state), trace)
+            kept.write(arrays_of(state), course)
     if kept is not None and not late:
-        kept.write(arrays_of(state), trace)
-    return state, trace
+        kept.write(arrays_of(state), course)
+    return state, course
 
 
 def arrays_of(state: Any) -> list[np.ndarray]:
@@ -103,12 +122,16 @@ def is_key(leaf: Any) -> bool:
 
 
 def like(state: Any, leaves: Sequence[np.ndarray]) -> Any:
-    """The stored leaves in the form of a state, on the device where its own are."""
+    """The stored leaves in the form of a state, on the device where its own are; raises `InputError` for others."""
+    own, form = jax.tree.flatten(state)
+    if len(own) != len(leaves):
+        raise InputError(
+            "the state of the stored run has another form than this run's: begin anew with --overwrite (overwrite=True)"
+        )
 
     def restored(stored: np.ndarray, own: Any) -> Any:
         if is_key(own):
             return jax.random.wrap_key_data(jnp.asarray(stored), impl=jax.random.key_impl(own))
         return jnp.asarray(stored) if isinstance(own, jax.Array) else stored
 
-    own, form = jax.tree.flatten(state)
     return jax.tree.unflatten(form, [restored(*pair) for pair in zip(leaves, own, strict=True)])

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.gaussian.engine import Engine
 from probcal.gaussian.linearised import LaplaceApproximation
 from probcal.gaussian.mode import Point
-from probcal.inference.loop import Task, Trace, run
+from probcal.inference.loop import Task, run
 from probcal.inference.progress import Monitor
 from probcal.inference.storage import Storage
 from probcal.model.model import Mixing
@@ -58,9 +60,46 @@ class Context(NamedTuple):
     threads: int | None = None
     fallback: Any = None  # the sampler that takes over where a collapse does not fit
 
-    def run(self, task: Task) -> tuple[Any, Trace]:
+    def run(self, task: Task) -> tuple[Any, Any]:
         """The last state of a task and its course."""
         return run(task, self.monitor, self.storage)
+
+
+@dataclass(eq=False)
+class MethodTask(Task):
+    """A method on a problem: its state before the first iteration, its steps, and the answer of its last state.
+
+    A method is written as one of these: `init`, `step`, `ended` and `outcome`. The loop owns all else.
+    """
+
+    method: Any
+    problem: Problem
+    prior: Prior
+    start: Point
+    context: Context
+
+    @property
+    def name(self) -> str:
+        """The name of the method."""
+        return str(self.method.name)
+
+    @property
+    def iterations(self) -> int:
+        """The most iterations of the method."""
+        return int(self.method.iterations)
+
+    @property
+    def biases(self) -> int:
+        """Number of the biases of the problem."""
+        return self.problem.model.biases
+
+    @abstractmethod
+    def outcome(self, state: Any, course: Any) -> Answer:
+        """The answer of the last state and the course."""
+
+    def recovered(self, error: MemoryError | np.linalg.LinAlgError) -> Answer:
+        """The answer in another way after an error; raises it, or one that says what to do, where there is none."""
+        raise error
 
 
 class Method(ABC):
@@ -78,8 +117,16 @@ class Method(ABC):
         return False
 
     @abstractmethod
+    def task(self, problem: Problem, prior: Prior, start: Point, context: Context) -> MethodTask:
+        """The work of the method on a problem, from a start."""
+
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """Solve a problem from a start."""
+        task = self.task(problem, prior, start, context)
+        try:
+            return task.outcome(*context.run(task))
+        except (MemoryError, np.linalg.LinAlgError) as error:
+            return task.recovered(error)
 
     def first_prior(self) -> Prior:
         """The prior where none is given."""
@@ -128,14 +175,15 @@ class Iterated(Method, ABC):
 
     iterations: int  # most outer iterations
     tolerance: float  # change of the objective at which it stops
+    engine: str | Engine = "dense"  # that expands the posterior, by name or as a value
 
 
 class ParticleSmoother(ABC):
     """What the core asks of particles."""
 
     @abstractmethod
-    def climbed(self, problem: Problem, method: Iterated, prior: Prior, start: Point, context: Context) -> Answer:
-        """The answer of EM whose E-step draws particles, from the biases of a start."""
+    def task(self, method: Iterated, problem: Problem, prior: Prior, start: Point, context: Context) -> MethodTask:
+        """The climb of EM whose E-step draws particles, from the biases of a start."""
 
     @abstractmethod
     def tracked(

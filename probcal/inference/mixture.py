@@ -13,6 +13,7 @@ import numpy as np
 
 from probcal.errors import InputError
 from probcal.gaussian.draws import draw, draw_biases, draws_a_chain
+from probcal.gaussian.engine import Estimate, Expansion, Factors
 from probcal.gaussian.mode import Point
 from probcal.inference.hierarchy import drawn_precisions, held, inclusions
 from probcal.inference.integrate import Integrated
@@ -25,6 +26,7 @@ from probcal.results.answer import (
     Draws,
     Posterior,
     Summary,
+    blocks_under,
     few_draws,
     precisions_of,
     tracks_at,
@@ -61,6 +63,22 @@ def gaussian(
         columns=columns,
     )
     return Posterior(problem, prior, point, summary, known.pop("draw", draw_gaussian), **known)
+
+
+def gaussian_at(problem: Problem, prior: Prior, at: Expansion, worth: Estimate) -> Posterior:
+    """The Gaussian at a mode, expanded by any engine; `worth` is its log evidence."""
+    first = prior.precision(problem.labels, problem.surveyed)
+    factors = Factors.of(first)
+    spread = at.spread(factors)
+    blocks = blocks_under(at, factors, spread)
+    declared = blocks if prior.proper else blocks.under_scales()
+    errors = {"sd_error": 0.5 * spread.error / spread.biases} if spread.error.any() else {}
+    numbers = {"log_evidence_error": worth.error} if prior.proper and worth.error else {}
+    return gaussian(
+        problem, prior, at.point, blocks, first.alpha, evidence=worth.value, columns=declared.contraction() | errors,
+        at=at, factors=factors, moments=tracks_at(at.point, spread.states), declared=declared,
+        attrs={"rope": ROPE} | numbers,
+    )  # fmt: skip
 
 
 def gaussian_biases(own: Posterior, key: jax.Array) -> np.ndarray:

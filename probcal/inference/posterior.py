@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -11,14 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian.draws import draws_a_chain, predictive
-from probcal.gaussian.information import at_levels, mean_square
+from probcal.gaussian.information import at_levels
 from probcal.gaussian.mode import Point
+from probcal.inference.chains import Draw
 from probcal.inference.ending import FAR, bias_status, misfit_sentence
 from probcal.inference.hierarchy import drawn_precisions, inclusions
 from probcal.inference.mixed import ESS, R_HAT, UNSURE, mixing, weights_of_sides, within_sides
-from probcal.inference.pose import pareto_khat
-from probcal.inference.posed import Posed
-from probcal.inference.sampling import SamplerRun
+from probcal.inference.pose import Worth, pareto_khat
+from probcal.inference.posed import Form, Natural, Posed
+from probcal.inference.sampler import Sampler
 from probcal.model.motions import level_values
 from probcal.modes.explore import Mirrored
 from probcal.modes.grid import track_mode
@@ -33,6 +35,48 @@ RARE = 0.05  # share of leaps, or of swings, taken below which it is said
 # Pareto k-hat from which importance weights, and so a guide, are unreliable (Vehtari et al. 2024)
 K_HAT = 0.7
 BFMI = 0.3  # below which the energy is not explored (Betancourt 2016)
+
+
+@dataclass(frozen=True, eq=False)
+class SamplerRun:
+    """What a sampler leaves: its draws, and how the run went."""
+
+    method: Sampler
+    asked: Sampler  # the method that was asked for, where another took over
+    form: Form
+    posed: Posed | Natural
+    worth: Worth | None  # of the frame, where there is one
+    draws: Draw  # leading dims (chain, draw) of every array
+    seconds: float
+    stopped: str  # why it was ended before all draws were made; empty where they were
+    note: str  # what happened on the way, a sentence or nothing
+    sides: tuple[Mirrored, ...] = ()  # other sides of a mirror that the chains visit, numbered from 1
+    thin: int = 1  # steps from one draw to the next
+
+    @property
+    def z(self) -> np.ndarray:
+        """Biases (chain, draw, M) over their scales."""
+        return np.asarray(self.draws.theta)[..., : self.form.biases]
+
+    @property
+    def side(self) -> np.ndarray:
+        """Which side of a mirror each draw (chain, draw) is on, 0 where there is none."""
+        return side_of_draws(self.draws)
+
+    @property
+    def levels(self) -> np.ndarray:
+        """Log levels (chain, draw, H)."""
+        return np.asarray(self.draws.theta)[..., self.form.biases :]
+
+    @property
+    def states(self) -> list[np.ndarray]:
+        """States (chain, draw, E, n) of each recursion."""
+        return [np.asarray(x) for x in self.draws.states]
+
+
+def side_of_draws(draws: Draw) -> np.ndarray:
+    """Which side of a mirror each draw (chain, draw) is on, 0 where there is none."""
+    return np.asarray(draws.stats.get("side", np.zeros(np.shape(draws.theta)[:2], int)))
 
 
 def chains(
@@ -93,12 +137,12 @@ def _numbers(run: SamplerRun) -> dict[str, float]:
 
 def conclude_draws(
     problem: Problem, prior: Prior, run: SamplerRun, posterior_of: Callable[..., Posterior] = chains,
-    misfit: Callable[[Problem, Point], str] | None = None, **facts: Any,
+    misfit: Callable[[Problem, Point], str] = misfit_sentence, **facts: Any,
 ) -> Answer:  # fmt: skip
     """The answer of a sampler's run; `misfit` says why its mean explains nothing, `facts` are further ones."""
     mixed = mixing(within_sides(np.asarray(run.draws.theta), run.side))
     posterior = posterior_of(problem, prior, run, mixed)
-    unexplained = (misfit or _misfit)(problem, posterior.point)
+    unexplained = misfit(problem, posterior.point)
     known = facts_of(problem, run, mixed) | ({} if unexplained else facts_of_steps(problem, prior, run))
     status, message = judge(CHAINS, known | facts | {"misfit": unexplained})
     ended = bias_status(problem, {"not mixed": mixed["r_hat"][: run.form.biases] > 1.05} if "r_hat" in mixed else {})
@@ -106,10 +150,6 @@ def conclude_draws(
         problem, run.method, run.asked, prior, posterior, status, message, ended, run.z.shape[1],
         interrupted=bool(run.stopped), mirrors=_mirrors(run, str(status)),
     )  # fmt: skip
-
-
-def _misfit(problem: Problem, point: Point) -> str:
-    return misfit_sentence(problem, point, float(mean_square(problem.model, point)))
 
 
 def heaviest(run: SamplerRun) -> int:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -225,15 +225,22 @@ class Propagation(Task):
     begun: Any  # (B, p, p) covariances of the first round, under the declared scales
     settled: bool = False  # whether the means came to rest
 
+    name: ClassVar[str] = "expectation propagation"
+    iterations: ClassVar[int] = ROUNDS
+
+    @property
+    def biases(self) -> int:
+        """Number of the biases."""
+        return self.form.biases
+
     @classmethod
     def of(cls, form: Form, first: Precision, likelihood: BiasLikelihood, members: np.ndarray, key: jax.Array) -> Any:
         """The beginning: biases of their declared scales."""
         precision = np.eye(members.shape[1])[None] * np.isin(members, form.hierarchy.learnt)[:, :, None]
         sites, none = Blocks(precision, np.zeros(members.shape)), np.zeros(0)
         chain = BlockChain(jnp.asarray(none), form.hierarchy.begin(jax.random.fold_in(key, 0)))
-        own = "expectation propagation", ROUNDS, form.biases
         swept = BlocksSwept(*[none] * 5)
-        return cls(*own, form, first, likelihood, members, key, sites, sites, chain, swept, none)
+        return cls(form, first, likelihood, members, key, sites, sites, chain, swept, none)
 
     @property
     def factors(self) -> Factors:

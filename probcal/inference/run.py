@@ -19,17 +19,16 @@ from probcal.errors import InputError
 from probcal.gaussian.choose import engine_of, estimates
 from probcal.gaussian.dense import DenseEngine
 from probcal.gaussian.engine import Engine, Factors
-from probcal.gaussian.information import mean_square
 from probcal.gaussian.linearised import LaplaceApproximation, laplace
 from probcal.gaussian.mode import Point
 from probcal.gaussian.search import chosen
 from probcal.gaussian.tails import Variances, renewed_noise
 from probcal.inference.ending import FAR, conclude
-from probcal.inference.engined import climb_on
+from probcal.inference.engined import HostClimb
 from probcal.inference.hierarchy import held, learnt_groups
 from probcal.inference.integrate import Integration, integrate
-from probcal.inference.loop import Pause, Task, Trace
-from probcal.inference.method import Context, Given, Iterated, State
+from probcal.inference.loop import Pause, Trace
+from probcal.inference.method import Context, Given, Iterated, MethodTask, State
 from probcal.inference.placed import Reached, with_places
 from probcal.model.model import Model
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Gaussian, Precision, Prior
@@ -42,54 +41,43 @@ STALLED = 8  # climbs on the host after which one that gains nothing is given up
 
 
 @dataclass(eq=False)
-class KernelClimb(Task):
-    """The iterations of a method from a start: in jitted chunks, or one by one where these are long."""
+class KernelClimb(MethodTask):
+    """The iterations of a method from a start: in jitted chunks, or one by one where these are long.
 
-    method: Any
-    model: Model
-    prior: Prior  # of the climb, without what reaches kernels as arrays
-    given: Given
-    start: Point
-    key: jax.Array
+    Where precisions are not given, a bias that starts far from its stated value has that of its start: robust
+    noise would rather reject a sensor than hold an exchanged place against the declared scale.
+    """
+
     alpha: np.ndarray | None = None  # (M,) precisions to begin with, those of the prior if None
 
-    @classmethod
-    def of(
-        cls, method: Maximiser, problem: Problem, prior: Prior, start: Point, key: jax.Array,
-        alpha: np.ndarray | None = None,
-    ) -> KernelClimb:  # fmt: skip
-        """The climb on a problem.
-
-        Where precisions are not given, a bias that starts far from its stated value has that of its start: robust
-        noise would rather reject a sensor than hold an exchanged place against the declared scale.
-        """
-        check_method(method)
-        given = given_of(method, problem, prior)
-        far = (np.abs(start.z) > FAR) & ~held(prior, problem)
-        if alpha is None and prior.hierarchical and far.any():
-            alpha = np.where(far, np.maximum(np.abs(start.z), FAR) ** -2.0, given.prior.alpha)
-        own = method.name, method.iterations, problem.model.biases
-        return cls(*own, method, problem.model, bare(method.climbs_under(prior)), given, start, key, alpha)
+    def __post_init__(self) -> None:
+        self.model, self.given = self.problem.model, given_of(self.method, self.problem, self.prior)
+        self.bare = bare(self.method.climbs_under(self.prior))  # without what reaches kernels as arrays
 
     @property
     def on_host(self) -> bool:
         """True where iterations are made one by one."""
-        return bool(self.method.steps_on_host(self.model, self.prior))
+        return bool(self.method.steps_on_host(self.model, self.bare))
 
     def init(self) -> State:
         """The state before the first iteration."""
-        state = first_state(self.given, self.model, self.start, self.method.begin(self.model, self.start), self.key)
-        return state if self.alpha is None else state._replace(alpha=jnp.asarray(self.alpha))
+        state = first_state(
+            self.given, self.model, self.start, self.method.begin(self.model, self.start), self.context.key
+        )
+        far, alpha = (np.abs(self.start.z) > FAR) & ~held(self.prior, self.problem), self.alpha
+        if alpha is None and self.prior.hierarchical and far.any():
+            alpha = np.where(far, np.maximum(np.abs(self.start.z), FAR) ** -2.0, self.given.prior.alpha)
+        return state if alpha is None else state._replace(alpha=jnp.asarray(alpha))
 
     def step(self, state: State, count: int, pause: Pause) -> tuple[State, Trace]:
         """A chunk of iterations, or one."""
-        fixed = self.model, self.prior, self.given
+        fixed = self.model, self.bare, self.given
         if not self.on_host:
             left = self.iterations - count
             state, (course, idle) = chunk(kernel(self.method), *fixed, state, left)
             return state, jax.tree.map(lambda leaf: np.asarray(leaf)[~np.asarray(idle)], course)
         state = stepped(self.method, *fixed, state)
-        state = self.method.close(self.model.with_mixing(state.mixing), self.prior, self.given, state)
+        state = self.method.close(self.model.with_mixing(state.mixing), self.bare, self.given, state)
         return state, jax.tree.map(lambda leaf: np.asarray(leaf)[None], course_of(state))
 
     def ended(self, state: State, trace: Trace) -> bool:
@@ -99,34 +87,62 @@ class KernelClimb(Task):
             return not max(worth[-STALLED:]) > max(worth[:-STALLED]) + self.method.tolerance
         return bool(state.done)
 
+    def outcome(self, state: State, course: Trace) -> Answer:
+        """The Gaussian at the last state, or the mixture where precisions are integrated there.
+
+        Where a method integrates trajectories, places that are far from Gaussian are integrated at the point that was
+        reached, and it climbs again with what they add.
+        """
+        method, problem, prior, context = self.method, self.problem, self.prior, self.context
+        state, course = method.further(self, state, course)
+        if method.integrates_places and self.model.rests:
+            problem, state, course = self._with_places(state, course)
+        how, mixed = method.integration(problem, prior), None
+        problem = problem.with_mixing(state.mixing)
+        if how is not None:
+            mixed = integrate(
+                how, problem.model, first_precision(problem, prior), state.point, context.key, search=True
+            )
+        return conclude(problem, method, prior, state, course, how, mixed, context.monitor.stopped)
+
+    def _with_places(self, state: State, trace: Trace) -> tuple[Problem, State, Trace]:
+        """The problem with what integrated places add, the state there and the course of all climbs."""
+        method, prior, engine, stopped = self.method, self.prior, DenseEngine(), self.context.monitor
+
+        def reached(problem: Problem, state: State) -> Reached:
+            problem = problem.with_mixing(state.mixing)
+            factors = Factors.of(self.given.prior._replace(alpha=state.alpha))
+            at, value = engine.at(problem.model, state.point), float(state.worth)
+            if not (method.climbs_under(prior).learns or problem.model.learns_noise):
+                value = at.density() + factors.value(state.point.z)
+            return Reached(problem, at, factors, value, state)
+
+        def climb(problem: Problem, start: Point) -> Reached:
+            nonlocal trace
+            state, more = method.climb(problem, prior, start, self.context)
+            trace = trace.and_then(more)
+            return reached(problem, state)
+
+        end, agree = with_places(climb, reached(self.problem, state), engine, lambda: stopped.stopped)
+        state = end.state
+        if end.problem.tilted:
+            found = laplace(end.at.model, state.point, self.given.prior._replace(alpha=state.alpha))
+            state = state._replace(found=found)
+        done = state.done if agree else jax.device_put(np.array(False))
+        return end.problem, state._replace(done=done), trace
+
 
 class Maximiser(Iterated, ABC):
     """A method that climbs to a point by a pure `iterate` and reports a Gaussian there."""
 
-    engine: str | Engine = "dense"  # that expands the posterior, by name or as a value
     trajectory: str = "joint"  # mode of biases and trajectories, or "marginal": of the biases
 
-    def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
-        """Climb from a start until it is done or its iterations are spent.
-
-        Where a method integrates trajectories, places that are far from Gaussian are integrated at the point that was
-        reached, and it climbs again with what they add. What is too large for the dense engine is
-        climbed from the host on another.
-        """
-        if (engine := self.expands_by(problem.model)) is not None:
-            return climb_on(engine, self, problem, prior, start, context)
-        state, trace = self.climb(problem, prior, start, context)
-        if self.integrates_places and problem.model.rests:
-            problem, state, trace = self._with_places(problem, prior, state, trace, context)
-        how, mixed = self.integration(problem, prior), None
-        problem = problem.with_mixing(state.mixing)
-        if how is not None:
-            first = first_precision(problem, prior)
-            mixed = integrate(how, problem.model, first, state.point, context.key, search=True)
-        square = float(mean_square(problem.model, state.point if mixed is None else mixed.point))
-        stopped = context.monitor.stopped
-        found = conclude(problem, self, prior, state, trace.objective, square, trace.iterations, how, mixed, stopped)
-        return replace(found, steps=trace.z, precisions=trace.alpha)
+    def task(self, problem: Problem, prior: Prior, start: Point, context: Context) -> MethodTask:
+        """A climb by kernels; of what is too large for the dense engine from the host, on another."""
+        check_method(self)
+        own = self, problem, prior, start, context
+        engine = self.expands_by(problem.model)
+        return KernelClimb(*own) if engine is None else HostClimb.of(*own, engine)
 
     def expands_by(self, model: Model, *, fast: bool = False) -> Engine | None:
         """The engine that a climb from the host asks; None where kernels of the dense one climb.
@@ -147,34 +163,6 @@ class Maximiser(Iterated, ABC):
             )
         return "one start" if starts > 1 else ""
 
-    def _with_places(
-        self, plain: Problem, prior: Prior, state: State, trace: Trace, context: Context
-    ) -> tuple[Problem, State, Trace]:
-        """The problem with what integrated places add, the state there and the course of all climbs."""
-        given, engine = given_of(self, plain, prior).prior, DenseEngine()
-
-        def reached(problem: Problem, state: State) -> Reached:
-            problem = problem.with_mixing(state.mixing)
-            at, factors = engine.at(problem.model, state.point), Factors.of(given._replace(alpha=state.alpha))
-            value = float(state.worth)
-            if not (self.climbs_under(prior).learns or problem.model.learns_noise):
-                value = at.density() + factors.value(state.point.z)
-            return Reached(problem, at, factors, value, state)
-
-        def climb(problem: Problem, start: Point) -> Reached:
-            nonlocal trace
-            state, more = self.climb(problem, prior, start, context)
-            trace = trace.and_then(more)
-            return reached(problem, state)
-
-        end, agree = with_places(climb, reached(plain, state), engine, lambda: context.monitor.stopped)
-        state = end.state
-        if end.problem.tilted:
-            found = laplace(end.at.model, state.point, given._replace(alpha=state.alpha))
-            state = state._replace(found=found)
-        done = state.done if agree else jax.device_put(np.array(False))
-        return end.problem, state._replace(done=done), trace
-
     def climbs_once(self, problem: Problem, prior: Prior) -> bool:
         """Whether an answer is what one climb finds (and an integration there), so that many are one kernel."""
         dense = self.expands_by(problem.model) is None
@@ -189,7 +177,12 @@ class Maximiser(Iterated, ABC):
         self, problem: Problem, prior: Prior, start: Point, context: Context, alpha: np.ndarray | None = None
     ) -> tuple[State, Trace]:
         """The last state of the outer loop and its course, from precisions `alpha` (M,) where these are given."""
-        return context.run(KernelClimb.of(self, problem, prior, start, context.key, alpha))
+        task = KernelClimb(self, problem, prior, start, context, alpha)
+        return self.further(task, *context.run(task))
+
+    def further(self, task: KernelClimb, state: State, course: Trace) -> tuple[State, Trace]:
+        """State and course after what a method does where a climb has ended: nothing, unless said otherwise."""
+        return state, course
 
     def climbs_under(self, prior: Prior) -> Prior:
         """The prior of the climb: where precisions are integrated after it, not that of the fit."""

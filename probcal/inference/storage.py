@@ -45,6 +45,7 @@ from probcal.inference.manifest import (
 
 Arrays = Mapping[str, Any]
 EVERY = 2.0  # s from one state of a climb that is written to the next
+DRAWS = "draws_"  # begins the names of arrays of draws in a part
 SELDOM = 20.0  # times what a write took, until the next one at least
 
 
@@ -159,10 +160,12 @@ class Storage:
             write_whole(self._file(number), content.getbuffer())
         self._numbers.add(number)
 
-    def checkpoint(self, first: Sequence[Any]) -> Checkpoint | None:
-        """The part of the next loop of a fit, whose first state has these leaves; None where loops are not kept."""
-        if self.path is None or self.kind != "climb":
+    def checkpoint(self, kind: str, first: Sequence[Any]) -> Checkpoint | Chunks | None:
+        """What keeps the next loop of a kind, whose first state has these leaves; None where it is not kept."""
+        if self.path is None or self.kind != kind:
             return None
+        if kind == "draws":
+            return Chunks(self)
         self._loops += 1
         return Checkpoint(self, self._loops - 1, first)
 
@@ -183,33 +186,24 @@ def numbered(part: Arrays, name: str) -> list[Any]:
 
 
 class Chunks:
-    """Draws of a sampler in order, (chains, draws, ...) by name, and the state after the last."""
+    """Draws of a sampler, a part for each chunk: its arrays by name, and the state after it."""
+
+    due = True
 
     def __init__(self, storage: Storage):
         self.storage = storage
-        self.state: list[np.ndarray] | None = None
-        for number in range(self.count):  # all of them, so that a damaged or missing one is told before any work
-            self.state = numbered(storage.read(number), "state")
+        self.found: tuple[list[np.ndarray], list[Arrays]] | None = None  # leaves of the state; the chunks
+        chunks = list[Arrays]()
+        for number in range(len(storage.numbers)):
+            part = storage.read(number)
+            chunks.append({name.removeprefix(DRAWS): own for name, own in part.items() if name.startswith(DRAWS)})
+            self.found = numbered(part, "state"), chunks
 
-    @property
-    def count(self) -> int:
-        """How many chunks there are."""
-        return len(self.storage.numbers)
-
-    def add(self, chunk: Arrays, state: Sequence[Any]) -> None:
-        """Append a chunk and the leaves of the state after it."""
+    def write(self, state: Sequence[Any], course: Sequence[Arrays]) -> None:
+        """Append the chunks that are not there yet, with the leaves of the state after them."""
         leaves = {f"state_{k}": np.asarray(leaf) for k, leaf in enumerate(state)}
-        self.storage.add(self.count, {f"draws_{name}": array for name, array in chunk.items()} | leaves)
-        self.state = list(leaves.values())
-
-    def joined(self, first: int = 0, last: int | None = None) -> dict[str, np.ndarray]:
-        """Draws (chains, draws, ...) by name of the chunks from the first up to the last, without it."""
-        prefix = "draws_"
-        chunks = [
-            {name.removeprefix(prefix): array for name, array in part.items() if name.startswith(prefix)}
-            for part in map(self.storage.read, self.storage.numbers[first:last])
-        ]
-        return {name: np.concatenate([chunk[name] for chunk in chunks], 1) for name in chunks[-1]}
+        for number in range(len(self.storage.numbers), len(course)):
+            self.storage.add(number, {DRAWS + name: array for name, array in course[number].items()} | leaves)
 
 
 class Checkpoint:

@@ -12,9 +12,8 @@ import numpy as np
 
 from probcal import linalg
 from probcal.gaussian.search import halved
-from probcal.inference.hierarchy import held
-from probcal.inference.loop import Pause, Task, Trace
-from probcal.inference.method import Context, Given
+from probcal.inference.loop import Pause, Trace
+from probcal.inference.method import Given, MethodTask
 from probcal.inference.run import bare, check_method, given_of, learn
 from probcal.model.model import At, Model
 from probcal.particles.ensemble import (
@@ -168,49 +167,55 @@ def _variance_of_mean(trace: np.ndarray) -> np.ndarray:
 
 
 @dataclass(eq=False)
-class ParticleClimb(Task):
-    """The iterations of EM by particles, from biases z (M,); it ends where these only scatter about a place."""
+class ParticleClimb(MethodTask):
+    """The iterations of EM by particles, from the biases of a start; it ends where these only scatter about a place."""
 
-    problem: Problem
-    targets: tuple[Targets, ...]
     how: ParticleSettings
-    prior: Prior
-    given: Given
-    z: Any
-    key: jax.Array
-    settles: bool = False  # whether it may end before all iterations are done
+    key: jax.Array | None = None  # of the iterations; one of the context's if None
+
+    def __post_init__(self) -> None:
+        check_method(self.method)
+        check_learnt(self.problem)
+        self.targets = prepared(self.problem, self.how)
+        if self.problem.model.driven and self.how.smoother == "marginal":
+            self.how = replace(self.how, smoother="exact")  # levels of process noise are learnt along paths
+        if np.any(np.asarray(self.start.z)):  # a start that is known is not left again
+            self.how = replace(self.how, tempered=0)
+        self.given, self.bare = given_of(self.method, self.problem, self.prior), bare(self.prior)
 
     def init(self) -> Climb:
         """The state before the first iteration."""
         for own in self.targets if self.how.m_step == "averaged" else ():
             own.model.check_density()
-        alpha, z = self.given.prior.alpha, np.asarray(self.z, float)
-        return _beginning(self.problem.model, self.targets, alpha, z, self.key, self.how)
+        alpha, z = self.given.prior.alpha, np.asarray(self.start.z, float)
+        key = jax.random.split(self.context.key)[0] if self.key is None else self.key
+        return _beginning(self.problem.model, self.targets, alpha, z, key, self.how)
 
     def step(self, state: Climb, count: int, pause: Pause) -> tuple[Climb, Trace]:
         """A chunk of iterations."""
         last, left = jnp.asarray(self.iterations), self.iterations - count
-        state, trace = em_chunk(self.problem.model, self.targets, self.prior, self.given, state, last, self.how)
+        state, trace = em_chunk(self.problem.model, self.targets, self.bare, self.given, state, last, self.how)
         return state, jax.tree.map(lambda leaf: np.asarray(leaf)[:left], trace)
 
     def ended(self, state: Climb, trace: Trace) -> bool:
         """True where the biases only scatter."""
-        return self.settles and trace.iterations >= 2 * WINDOW and self.wandering(state, trace).still
+        settles = self.method.tolerance > 0 and trace.iterations >= 2 * WINDOW
+        return settles and self.wandering(state, trace).still
 
     def wandering(self, state: Climb, trace: Trace) -> Wandering:
         """The comparison of the last iterations with as many before them."""
         return wandering(trace.z, np.sqrt(state.variance))
 
-
-def climb(problem: Problem, how: ParticleSettings, prior: Prior, z: Any, iterations: int, key: jax.Array) -> Climb:
-    """Where the loop stands after some iterations from biases z (M,) under a prior: a start for a sampler."""
-    given = Given(
-        prior.precision(problem.labels, problem.surveyed), jnp.asarray(held(prior, problem)),
-        jnp.arange(problem.model.biases), jnp.zeros(()),
-    )  # fmt: skip
-    own = "start", iterations, problem.model.biases
-    state, _ = Context(key).run(ParticleClimb(*own, problem, prepared(problem, how), how, bare(prior), given, z, key))
-    return state
+    def outcome(self, state: Climb, course: Trace) -> Answer:
+        """A Gaussian about the biases, its information by scores."""
+        still = self.wandering(state, course)
+        over = course.iterations >= self.iterations or self.ended(state, course)
+        stopped = "" if over else self.context.monitor.stopped
+        if still.still and self.how.m_step != "averaged":  # what is left is the noise of the particles
+            state = state._replace(z=jnp.asarray(course.z[-min(WINDOW, len(course.z) // 2) :].mean(0)))
+        ended = Ended(state.z, state.levels, state.alpha, course, still.still, _moved(self.problem, still), stopped)
+        own, key = (self.problem, self.method, self.how, self.prior), jax.random.split(self.context.key)[1]
+        return conclude_particles(*own, self.given, self.targets, ended, key)
 
 
 @partial(jax.jit, static_argnames="how")
@@ -225,31 +230,6 @@ def _beginning(
         paths = first_paths(targets, ensemble(model, cool, z, levels, keys[1], crowd))
     nothing, none = jnp.zeros((M, M)), jnp.zeros(M)
     return Climb(z, levels, alpha, nothing, none, jnp.zeros((), int), keys[0], paths, none, jnp.zeros(()))
-
-
-def climb_by_particles(
-    problem: Problem, method: Any, how: ParticleSettings, prior: Prior, z: Any, context: Context
-) -> Answer:
-    """Run the loop from biases z (M,) and conclude: a Gaussian about them, its information by
-    scores."""
-    check_method(method)
-    check_learnt(problem)
-    targets = prepared(problem, how)
-    if problem.model.driven and how.smoother == "marginal":
-        how = replace(how, smoother="exact")  # levels of process noise are learnt along paths
-    how = replace(how, tempered=0) if np.any(np.asarray(z)) else how  # a start that is known is not left again
-    model, given = problem.model, given_of(method, problem, prior)
-    keys = jax.random.split(context.key)
-    own = method.name, method.iterations, model.biases
-    task = ParticleClimb(*own, problem, targets, how, bare(prior), given, z, keys[0], method.tolerance > 0)
-    state, trace = context.run(task)
-    still = task.wandering(state, trace)
-    over = trace.iterations >= method.iterations or task.ended(state, trace)
-    stopped = "" if over else context.monitor.stopped
-    if still.still and how.m_step != "averaged":  # what is left is the noise of the particles
-        state = state._replace(z=jnp.asarray(trace.z[-min(WINDOW, len(trace.z) // 2) :].mean(0)))
-    ended = Ended(state.z, state.levels, state.alpha, trace, still.still, _moved(problem, still), stopped)
-    return conclude_particles(problem, method, how, prior, given, targets, ended, keys[1])
 
 
 def _moved(problem: Problem, still: Wandering) -> str:

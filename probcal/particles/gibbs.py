@@ -7,9 +7,7 @@ hyper-parameters given the paths.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
@@ -23,17 +21,18 @@ from probcal.errors import InputError
 from probcal.gaussian.mode import Point
 from probcal.inference.chains import Draw, Sample
 from probcal.inference.draws import slice_step
+from probcal.inference.em import EM
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.method import Context
 from probcal.inference.posed import Form, Natural, conditional, log_prior, prior_precision
-from probcal.inference.posterior import chains, conclude_draws
+from probcal.inference.posterior import SamplerRun, chains, conclude_draws
 from probcal.inference.sampler import Sampler
-from probcal.inference.sampling import SamplerRun, drawn_by, restored_as
+from probcal.inference.sampling import Chains, DrawnChunks, each_chain
 from probcal.linalg import invert, without_negative
 from probcal.model.model import At, Model, Recursion
 from probcal.modes.grid import follow_states, track_mode
 from probcal.particles.conditional import conditional_path
-from probcal.particles.em import climb
+from probcal.particles.em import ParticleClimb
 from probcal.particles.ensemble import ensemble, expected_over_paths, first_paths, log_motion_of, state_moments
 from probcal.particles.particles import Particles
 from probcal.particles.proposals import check_proposal
@@ -112,40 +111,9 @@ class ParticleGibbs(Sampler):
         """The method whatever the number of its chains and draws."""
         return replace(self, chains=1, warmup=0, draws=1, patience=1)
 
-    def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
-        """Draws of the posterior from biases of a start, zero for a search, and what they say."""
-        began = time.perf_counter()
-        check_learnt(problem)
-        targets = prepared(problem, self.particles)
-        check_proposal(problem.model, self.particles, conditional=True)
-        for own in targets:
-            own.model.check_density()
-        keys = jax.random.split(context.key, 4)
-        crowd = replace(self.particles, count=max(self.particles.count, CROWD), smoother="backward")
-        z, levels = np.asarray(start.z), np.zeros(len(problem.levels))
-        if not z.any():  # a sweep goes where the last path was: chains are begun where the data may be explained
-            begun = climb(problem, crowd, Gaussian(), z, SEARCH, keys[3])
-            z, levels = np.asarray(begun.z), np.asarray(begun.levels)
-        paths = Paths(problem, crowd, targets)
-        told = louis(paths, z, levels, keys[0])
-        reference = expected_over_paths(problem.model, told.found, jnp.asarray(z), jnp.asarray(levels)).information
-        H = len(levels)
-        natural = Natural(
-            jnp.asarray(np.pad(told.information, (0, H))),
-            jnp.asarray(np.pad(told.information @ z + told.score, (0, H))),
-            problem.model.level_spread, prior.precision(problem.labels, problem.surveyed),
-        )  # fmt: skip
-        form = Form(problem.model.biases, hierarchy_of(prior, problem))
-        group, of_sensor = groups_of(problem.model, np.asarray(natural.first.coupled()))
-        held = Held(problem.model, targets, natural, group, reference, of_sensor)
-        runs = _Gibbs(self, form, held, paths, z, levels, keys[1])
-        drawn, thin, stopped = drawn_by(self, runs, 1, context.monitor, context.storage, context.threads)
-        run = SamplerRun(self, self, form, natural, None, drawn, time.perf_counter() - began, stopped, "", (), thin)
-        linear = all(part is None for part in problem.model.sampled)
-        share, solved = float(np.mean(drawn.stats["renewed"])), problem if linear else problem.seen()
-        renewed = (share,) if share < STUCK else ()
-        of_run = partial(particle_chains, paths=paths)
-        return conclude_draws(solved, prior, run, of_run, unexplained, renewed=renewed)
+    def task(self, problem: Problem, prior: Prior, start: Point, context: Context) -> ParticleChains:
+        """Draws of the posterior from biases of a start, zero for a search."""
+        return ParticleChains(self, problem, prior, start, context)
 
     def step(self, form: Form, posed: Any, chain: GibbsState) -> tuple[GibbsState, Sample]:
         """One sweep; `posed` is what is `Held`."""
@@ -318,37 +286,55 @@ def begin_chains(form: Form, how: Particles, held: Held, theta: Any, keys: jax.A
     return jax.lax.map(one, keys)
 
 
-class _Gibbs:
+@dataclass(eq=False)
+class ParticleChains(Chains):
     """Chains of particle Gibbs: a thread each on a CPU, one after the other on an accelerator."""
 
-    def __init__(
-        self, method: ParticleGibbs, form: Form, held: Held, paths: Paths, z: np.ndarray, levels: np.ndarray,
-        key: jax.Array,
-    ):  # fmt: skip
-        self.method, self.form, self.held, self.paths = method, form, held, paths
-        self.z, self.levels, self.keys = z, levels, jax.random.split(key, method.chains)
-
-    def first(self) -> GibbsState:
+    def init(self) -> GibbsState:
         """Chains about the start, further out than the data leave the biases, on paths drawn there."""
-        theta = np.concatenate([self.z, self.levels])
-        return begin_chains(self.form, self.paths.how, self.held, theta, self.keys)
+        problem, particles, prior = self.problem, self.method.particles, self.prior
+        check_learnt(problem)
+        targets = prepared(problem, particles)
+        check_proposal(problem.model, particles, conditional=True)
+        for own in targets:
+            own.model.check_density()
+        keys = jax.random.split(self.context.key, 4)
+        crowd = replace(particles, count=max(particles.count, CROWD), smoother="backward")
+        z, levels = np.asarray(self.start.z), np.zeros(len(problem.levels))
+        if not z.any():  # a sweep goes where the last path was: chains are begun where the data may be explained
+            alone = Context(keys[3])
+            search = ParticleClimb(EM(crowd, SEARCH, 0.0), problem, Gaussian(), self.start, alone, crowd, keys[3])
+            begun = alone.run(search)[0]
+            z, levels = np.asarray(begun.z), np.asarray(begun.levels)
+        self.paths = Paths(problem, crowd, targets)
+        told = louis(self.paths, z, levels, keys[0])
+        reference = expected_over_paths(problem.model, told.found, jnp.asarray(z), jnp.asarray(levels)).information
+        H = len(levels)
+        self.posed = natural = Natural(
+            jnp.asarray(np.pad(told.information, (0, H))),
+            jnp.asarray(np.pad(told.information @ z + told.score, (0, H))),
+            problem.model.level_spread, prior.precision(problem.labels, problem.surveyed),
+        )  # fmt: skip
+        self.form = Form(self.biases, hierarchy_of(prior, problem))
+        group, of_sensor = groups_of(problem.model, np.asarray(natural.first.coupled()))
+        self.held = Held(problem.model, targets, natural, group, reference, of_sensor)
+        seeds = jax.random.split(keys[1], self.method.chains)
+        return begin_chains(self.form, crowd, self.held, np.concatenate([z, levels]), seeds)
 
-    def restored(self, leaves: list[np.ndarray]) -> Any:
-        """The state of saved leaves."""
-        return restored_as(jax.eval_shape(self.first), leaves)
-
-    def advance(self, state: Any, thin: int, pool: ThreadPoolExecutor) -> tuple[Any, Draw]:
+    def advance(self, state: GibbsState, thin: int) -> tuple[GibbsState, Draw]:
         """All chains one chunk further, every `thin`-th sweep kept."""
+        method, form, sweeps = self.method.kernel(), self.form, jnp.asarray(thin)
+        chains, threads = self.method.chains, self.context.threads
+        return each_chain(lambda own: run_particle_sweeps(method, form, self.held, own, sweeps), state, chains, threads)
 
-        def one(k: int) -> tuple[Any, Draw]:
-            with jax.enable_x64(True):
-                own = jax.tree.map(lambda leaf: leaf[k], state)
-                return jax.block_until_ready(
-                    run_particle_sweeps(self.method.kernel(), self.form, self.held, own, jnp.asarray(thin))
-                )
-
-        found = list(pool.map(one, range(self.method.chains)))
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+    def outcome(self, state: GibbsState, course: DrawnChunks) -> Answer:
+        """What the draws say, and whether paths were renewed."""
+        run, problem = self.run(course), self.problem
+        linear = all(part is None for part in problem.model.sampled)
+        share, solved = float(np.mean(run.draws.stats["renewed"])), problem if linear else problem.seen()
+        renewed = (share,) if share < STUCK else ()
+        of_run = partial(particle_chains, paths=self.paths)
+        return conclude_draws(solved, self.prior, run, of_run, unexplained, renewed=renewed)
 
 
 def particle_chains(

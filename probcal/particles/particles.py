@@ -9,13 +9,12 @@ import jax
 import numpy as np
 
 from probcal.gaussian.mode import Point
-from probcal.inference.method import Context, Iterated, ParticleSmoother
-from probcal.particles.em import climb_by_particles
+from probcal.inference.method import Context, Iterated, MethodTask, ParticleSmoother
+from probcal.particles.em import ParticleClimb
 from probcal.particles.settings import ParticleSettings
 from probcal.particles.weighted import track_by_particles
 from probcal.priors import Prior
 from probcal.problem import Problem
-from probcal.results.answer import Answer
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -48,9 +47,9 @@ class Particles(ParticleSettings, ParticleSmoother):
     'backward'
     """
 
-    def climbed(self, problem: Problem, method: Iterated, prior: Prior, start: Point, context: Context) -> Answer:
-        """The answer of EM whose E-step draws particles, from the biases of a start."""
-        return climb_by_particles(problem, method, self, prior, start.z, context)
+    def task(self, method: Iterated, problem: Problem, prior: Prior, start: Point, context: Context) -> MethodTask:
+        """The climb of EM whose E-step draws particles, from the biases of a start."""
+        return ParticleClimb(method, problem, prior, start, context, self)
 
     def tracked(
         self, problem: Problem, z: np.ndarray, covariance: np.ndarray, levels: np.ndarray, key: jax.Array

@@ -323,9 +323,8 @@ def conclude_particles(
     error, stopped = float(np.max(slope.sd_error, initial=0.0)), bool(ended.stopped)
     worst = problem.labels[int(np.argmax(slope.sd_error))] if error else ""
     left, asked = notable_scatter(posterior.problem, posterior.point), method.tolerance == 0
-    worths, count = ended.trace.objective, ended.trace.iterations
-    answer = conclude_at(
-        posterior.problem, method, prior, posterior, worths, np.nan, count, converged=ended.still and not stopped,
+    return conclude_at(
+        posterior.problem, method, prior, posterior, ended.trace, converged=ended.still and not stopped,
         evidence=told.log_likelihood, stopped=ended.stopped,
         misfit=unexplained(posterior.problem, posterior.point),
         left=0.0 if stopped else left, ahead=ahead if ahead > AHEAD and not stopped else 0.0,
@@ -333,7 +332,6 @@ def conclude_particles(
         better="more particles" if how.m_step == "averaged" else 'm_step="averaged", more particles',
         moved=ended.said if asked else "", moving="" if asked else ended.said,
     )  # fmt: skip
-    return replace(answer, steps=ended.trace.z, precisions=ended.trace.alpha)
 
 
 def steepness(slope: np.ndarray, covariance: np.ndarray, noise: np.ndarray) -> float:

@@ -20,7 +20,7 @@ from probcal.gaussian.frame import volume
 from probcal.gaussian.mode import Point, log_likelihood, mixed_density
 from probcal.inference.hierarchy import Hierarchy, Phi
 from probcal.inference.posed import Form, Posed, log_prior
-from probcal.inference.sampling import SamplerRun
+from probcal.inference.posterior import SamplerRun
 from probcal.lazy import Later
 from probcal.model.model import At, Model
 from probcal.problem import Problem

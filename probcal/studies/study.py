@@ -15,11 +15,11 @@ import xarray as xr
 
 from probcal.devices import over_devices
 from probcal.errors import InputError, nearest
-from probcal.gaussian.information import mean_square
 from probcal.gaussian.mode import Point
 from probcal.inference.ending import conclude
 from probcal.inference.identity import identity, problem_digest
 from probcal.inference.integrate import Integrated, Integration, integrate
+from probcal.inference.loop import Trace
 from probcal.inference.method import Context, Given, Method, State
 from probcal.inference.methods import METHODS, NUTS, check_problem, choose_prior
 from probcal.inference.progress import Monitor, OnProgress
@@ -40,7 +40,6 @@ from probcal.wings import check_method_installed
 CHECKED = 20  # stored problems that a resumed study makes anew, to see whether the model is still the same
 ORACLE = "oracle"  # MAP whose prior knows which biases are zero
 SEED = 0  # of what an E-step draws
-NOTHING = np.zeros(0)  # the trace of a batch, which keeps none
 Setting = Callable[..., tuple[Problem, Truth]]
 
 
@@ -49,7 +48,6 @@ class _Solved(NamedTuple):
 
     state: State
     mixed: Integrated | None  # where precisions are integrated after the climb
-    square: jax.Array  # () of what is left, a datum
     iterations: jax.Array  # ()
 
 
@@ -70,7 +68,7 @@ def _climb(
     model = model.with_mixing(state.mixing)
     state = method.close(model, prior, given, state)._replace(seed=jnp.zeros(()), carry=())
     mixed = None if how is None else integrate(how, model, given.prior, state.point, jax.random.key(SEED))
-    return _Solved(state, mixed, mean_square(model, state.point if mixed is None else mixed.point), count)
+    return _Solved(state, mixed, count)
 
 
 _alone = partial(jax.jit, static_argnums=(0, 1, 2))(_climb)
@@ -161,13 +159,13 @@ def _batch(
                 inside = how if how is not None and how.sweeps else None  # a propagation runs on the host
                 solved = _solve(kernel(method), climb, inside, method.iterations, pieces)
                 for j, k in enumerate(members):
-                    state, mixed, square, count = solved[j]
+                    state, mixed, count = solved[j]
                     problem = chosen[j].problem.with_mixing(state.mixing)
                     if how is not None and inside is None:
                         held = first_precision(problem, prior)
                         mixed = integrate(how, problem.model, held, state.point, jax.random.key(SEED))
-                        square = mean_square(problem.model, mixed.point)
-                    answer = conclude(problem, method, prior, state, NOTHING, float(square), int(count), how, mixed)
+                    course = Trace(*np.full((3, int(count)), np.nan))  # of a batch, which keeps none
+                    answer = conclude(problem, method, prior, state, course, how, mixed)
                     found.append({"run": runs[k].number, "method": name} | _record(chosen[j], answer))
         if stored:
             first = next(record for record in found if record["run"] == numbers[0])

@@ -9,7 +9,7 @@ import numpy as np
 
 from probcal.errors import FitError, InputError
 from probcal.gaussian.mode import Point
-from probcal.inference.method import Context, FitLabelled, Method
+from probcal.inference.method import Context, FitLabelled, Method, MethodTask
 from probcal.lazy import Later
 from probcal.priors import Prior
 from probcal.problem import Problem
@@ -120,9 +120,9 @@ class SelfConfiguration(Method):
             tree["rate"] = xr.DataTree(found.rates.rename_axis("line").to_xarray())
         return tree, answer
 
-    def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
+    def task(self, problem: Problem, prior: Prior, start: Point, context: Context) -> MethodTask:
         """That of the method within, where rows name their targets."""
-        return self.method.answer(problem, prior, start, context)
+        return self.method.task(problem, prior, start, context)
 
 
 def _facts(found: Configured, z: np.ndarray, name: str) -> dict[str, Any]:
