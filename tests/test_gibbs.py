@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import worlds
+from arviz_stats.base import array_stats
 from scipy import stats
 from sparse_worlds import LIBRARIES, drawn, drawn_in_space, loud
 
@@ -24,6 +25,7 @@ from probcal.inference.method import Context
 from probcal.inference.noise_step import draw_noise, levels_alone
 from probcal.inference.solve import solve
 from probcal.inference.split_hmc import Reference, SplitGaussian, placed, split_variables, variables_of
+from probcal.model.motions import level_values
 from probcal.modes import automatic_start
 
 SHORT = {"chains": 2, "warmup": 25, "draws": 50, "patience": 1}
@@ -394,6 +396,44 @@ def test_a_step_of_the_noise_leaves_the_joint_density_alone(made, single):
         assert np.abs(levels[:, h] - before[:, h]).max() > 0.1
     assert all(stats.kstest(4.0 * own[:, 3], stats.chi2(4).cdf).pvalue > 1e-3 for own in weights)
     assert np.abs(apart).max() < 1e-6
+
+
+@pc.sensor(range=pc.Channel("m", std=pc.Unknown(1.0, 2.0), noise=pc.StudentT(pc.Unknown(4.0, 3.0))))
+def tailed(target, pose, *, offset=pc.Bias("m", 1.0)):
+    """Range of unknown std and unknown tails."""
+    return dict(range=norm(target.position - pose.position) + offset)
+
+
+def test_a_level_beside_an_unknown_parameter_has_the_posterior_of_a_grid():
+    """Std and degrees of freedom of 24 residuals: mean and sd of 4,000 steps; limits five standard errors."""
+    network, motion = pc.Network([tailed.on(pc.Node("a", (0.0, 0.0)))]), pc.ConstantVelocity(1.0)
+    table = pd.DataFrame({"time": np.arange(24.0), "sensor": "a"})
+    table["range"] = np.abs(10.0 + stats.t(2.5).rvs(24, random_state=4))
+    problem = pc.Problem(network, motion, table)
+    model, point = problem.model, worlds.resting(problem)
+    point.states[0][:, 0] = 10.0
+
+    @jax.jit
+    def steps(keys):
+        def one(levels, key):
+            levels = draw_noise(model, point._replace(levels=levels), key, levels_alone(model))[1].levels
+            return levels, levels
+
+        return jax.lax.scan(one, jnp.zeros(2), keys)[1]
+
+    with jax.enable_x64(True):
+        drawn = level_values(problem.levels, steps(jax.random.split(jax.random.key(1), 4000)))
+    std, df = np.meshgrid(np.exp(np.linspace(-2.5, 2.0, 181)), 4.0 * np.exp(np.linspace(-4.0, 5.0, 181)), indexing="ij")
+    log = stats.t.logpdf(table["range"].to_numpy()[:, None, None] - 10.0, df, scale=std).sum(0)
+    log -= 0.5 * (np.log(std) / np.log(2.0)) ** 2 + 0.5 * (np.log(df / 4.0) / np.log(3.0)) ** 2
+    weight = np.exp(log - log.max()) / np.exp(log - log.max()).sum()
+    assert [level.label for level in problem.levels] == ["tailed.range_std", "tailed.range_df"]
+    for own, grid in zip(np.log(drawn).T, (np.log(std), np.log(df)), strict=True):
+        mean = (weight * grid).sum()
+        sd = np.sqrt((weight * (grid - mean) ** 2).sum())
+        effective = float(array_stats.ess(own[None], method="mean"))
+        assert own.mean() == pytest.approx(mean, abs=5 * sd / np.sqrt(effective))
+        assert own.std() / sd == pytest.approx(1.0, abs=5 / np.sqrt(effective))
 
 
 def test_correlated_surveys_have_their_exact_posterior():

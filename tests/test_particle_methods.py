@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import reference
+import worlds
 import xarray as xr
 
 import probcal
@@ -42,7 +43,7 @@ from probcal import (
 )
 from probcal.inference.loop import Trace
 from probcal.inference.run import given_of
-from probcal.particles.em import wandering
+from probcal.particles.em import Wandering, wandering
 from probcal.particles.ensemble import ensemble, nearest_states
 from probcal.particles.targets import targets_of
 from probcal.particles.weighted import SD_ERROR, Ended, Paths, conclude_particles, louis, regressed_scores, score_slope
@@ -84,6 +85,16 @@ def same(found, exact, *, shift, ratio):
     mine, theirs = found["calibration"].to_dataset(), exact["calibration"].to_dataset()
     assert (np.abs(mine["mean"] - theirs["mean"]) < shift * theirs["sd"]).all()
     assert (np.abs(np.log(mine["sd"] / theirs["sd"])) < np.log(ratio)).all()
+
+
+@pytest.mark.ci
+def test_a_climb_of_all_iterations_that_a_limit_stops_has_not_converged(monkeypatch):
+    """The biases may only scatter by then, but more iterations were asked for."""
+    monkeypatch.setattr("probcal.particles.em.wandering", lambda *_: Wandering(True, 0, 0.0))
+    problem, method = worlds.linear("plane")[0], EM(Particles(20), iterations=60, tolerance=0.0)
+    found = fit(problem, method, prior=Gaussian(), start=worlds.resting(problem), limit=1e-9)
+    assert found.attrs["status"] == "not converged"
+    assert "Ended by the limit of 1e-09 s after 5 iterations" in found.attrs["message"]
 
 
 @pytest.mark.slow
