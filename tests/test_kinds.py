@@ -30,7 +30,7 @@ from probcal import (
     sensor,
 )
 from probcal.inference import calibrate
-from probcal.inference.hierarchy import NoHyperprior, Product, held, hierarchy_of, learnt_groups
+from probcal.inference.hierarchy import Product, held, hierarchy_of, learnt_groups
 from probcal.inference.methods import choose_prior
 from probcal.priors import as_prior, by_kind
 from probcal.sensor import ZEROS
@@ -241,7 +241,7 @@ def test_a_learnt_kind_has_a_hierarchy_of_its_own():
     assert [(one.prior.share, one.prior.slab) for _, one in spike.pieces] == [(0.1, 1.0), (None, None)]
     for prior in (ARD(rate=0.5), Laplace()):
         assert hierarchy_of(prior, problem) == hierarchy_of(prior, ranges())
-    assert isinstance(hierarchy_of(Gaussian(), problem), NoHyperprior)
+    assert not hierarchy_of(Gaussian(), problem).learnt
 
 
 def test_the_last_pattern_counts_and_the_star_is_the_rest():

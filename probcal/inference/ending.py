@@ -10,7 +10,7 @@ import numpy as np
 from probcal.errors import FitError
 from probcal.gaussian.choose import choose
 from probcal.gaussian.draws import residuals
-from probcal.gaussian.engine import Expansion, Factors
+from probcal.gaussian.engine import Expansion, Factors, told_alone
 from probcal.gaussian.information import growing_square, mean_square, rejected, squares_of
 from probcal.gaussian.mode import Point
 from probcal.inference.integrate import Integrated, Integration
@@ -75,11 +75,8 @@ def diverged(problem: Problem, at: Expansion, factors: Factors) -> FitError:
 
     It names the biases that no row informs.
     """
-    told = np.append(np.zeros(problem.model.biases), 0.0)
-    for *_, read, lin in problem.model.each_block(problem.model.read, at.rows):
-        own = np.einsum("ncp,nc->np", np.asarray(lin.bias) ** 2, np.asarray(lin.weight))
-        np.add.at(told, read, own)
-    nothing = np.flatnonzero(told[:-1] + np.asarray(factors.diagonal(problem.model.biases)) == 0)
+    told = told_alone(at) + np.asarray(factors.diagonal(problem.model.biases))
+    nothing = np.flatnonzero(told == 0)
     silent = ", ".join([problem.labels[m] for m in nothing][:NAMED])
     why = f"no row tells {silent}" if silent else "the information matrix is singular"
     return FitError(f"The fit diverged: {why}; the estimate is invalid. Use a prior, or fix some biases.")

@@ -10,9 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.gaussian.mode import Point
 from probcal.inference.chains import Draw, run_chunk, run_sided, run_together
-from probcal.inference.method import Context
 from probcal.inference.orbits import orbits_of
 from probcal.inference.pose import chain_start, pose
 from probcal.inference.sampler import Sampler
@@ -20,18 +18,8 @@ from probcal.inference.sampling import Chains, each_chain
 from probcal.inference.sides import Sided, distances, side_by_side
 from probcal.modes.explore import Mirrored, new, reach
 from probcal.modes.mirrors import other_sides
-from probcal.priors import Prior
-from probcal.problem import Problem
 
 ROAMING = 0.9  # acceptance of leaps below which chains also move along orbits
-
-
-class FramedSampler(Sampler, ABC):
-    """A sampler with `first` and a pure `step` on the frame."""
-
-    def task(self, problem: Problem, prior: Prior, start: Point, context: Context) -> FramedChains:
-        """Draws of the posterior around a start."""
-        return FramedChains(self, problem, prior, start, context)
 
 
 @dataclass(eq=False)
@@ -93,3 +81,9 @@ class FramedChains(Chains):
             return run_together(run, method, form, self.where, state, steps)
         chains, threads = self.method.chains, self.context.threads
         return each_chain(lambda own: run(method, form, self.where, own, steps), state, chains, threads)
+
+
+class FramedSampler(Sampler, ABC):
+    """A sampler with `first` and a pure `step` on the frame."""
+
+    work = FramedChains

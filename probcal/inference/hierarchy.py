@@ -178,26 +178,6 @@ def _from_line(d: dist.Distribution) -> dist.transforms.Transform:
     return dist.transforms.ComposeTransform([dist.transforms.SoftplusTransform(), scale])
 
 
-class NoHyperprior(Hierarchy):
-    """A prior without hyper-parameters: Gaussian or flat."""
-
-    def hyper(self):
-        """None."""
-        return {}
-
-    def drawn(self):
-        """None."""
-        return {}
-
-    def governed(self, phi):
-        """None."""
-        raise AssertionError("a known prior governs no bias")
-
-    def updates(self):
-        """None."""
-        return []
-
-
 class GammaPrecision(Hierarchy):
     """ARD: one precision a group with a Gamma hyper-prior; the biases are then Student-t."""
 
@@ -422,7 +402,10 @@ class SpikeAndSlab(Hierarchy):
 
 @dataclass(frozen=True)
 class Product(Hierarchy):
-    """Hierarchies of disjoint biases, each with hyper-parameters of its own, called `<name>_<part>`."""
+    """Hierarchies of disjoint biases, each with hyper-parameters of its own, called `<name>_<part>`.
+
+    That of a Gaussian or flat prior has no part.
+    """
 
     pieces: tuple[tuple[str, Hierarchy], ...] = ()
 
@@ -595,7 +578,7 @@ def hierarchy_of(prior: Prior, problem: Problem) -> Hierarchy:
         return found[0][1]
     words = [word for word, _ in found]
     apart = [(f"{word}_{k}" if words.count(word) > 1 else word, one) for k, (word, one) in enumerate(found)]
-    return Product.of(prior, apart) if found else NoHyperprior(prior, (), ())
+    return Product.of(prior, apart)
 
 
 def inclusions(hierarchy: Hierarchy, z: np.ndarray, phi: Mapping[str, Any]) -> dict[str, np.ndarray]:

@@ -79,55 +79,6 @@ class _Chain(NamedTuple):
     rate: float  # of the last turn: how likely it was taken
 
 
-@dataclass(frozen=True)
-class Gibbs(Sampler):
-    """Exact posterior of biases, hyper-parameters and trajectories, sampled together: for networks of any size.
-
-    Each sweep draws the hyper-parameters given the biases, and unknown levels and latent scales of
-    the noise given biases and trajectories; it solves for the Gaussian of all states and biases
-    given those, by sparse factors where the network is large, and moves these together by a
-    Hamiltonian quarter turn about its mean, which splits off the Gaussian (Shahbaba and others
-    2014): an independent draw where the model is linear, elsewhere kicked as often as it takes to be
-    accepted. Any prior with a density.
-    Of more than four million numbers no draws of states are kept, their means and sds are. Chains
-    run one after the other; biases and tracks start at draws under the declared scales, on the side
-    of a mirror that fits best. They do not visit the others, which the answer names. Draws that
-    have not mixed are made anew with 4 times as many sweeps from one to the next, up to `patience`.
-    Raises `InputError` for less than one chain or draw.
-    """
-
-    chains: int = 4
-    warmup: int = 50
-    draws: int = 250
-    patience: int = 4
-
-    name: ClassVar[str] = "Gibbs"
-    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
-    chunk: ClassVar[int] = 25
-    engined: ClassVar[bool] = True
-    refusal: ClassVar[str] = (
-        "turns: the posterior is too far from the Gaussian of its linearised rows; take collapsed or nuts, of fewer"
-        " sensors where these do not fit"
-    )
-
-    def task(self, problem: Problem, prior: Prior, start: Point, context: Context) -> GibbsChains:
-        """Draws of the posterior from a start."""
-        return GibbsChains(self, problem, prior, start, context)
-
-    def keeps_states(self, model: Model) -> bool:
-        """Whether draws of all states are few enough to be kept."""
-        return self.chains * self.draws * model.state_size <= NUMBERS
-
-    def check_kept(self, problem: Problem, keep: tuple[str, ...]) -> None:
-        """Raise `InputError` where draws of states are asked for that would take too much room."""
-        if {"states", "replicas"} & set(keep) and not self.keeps_states(problem.model):
-            raise InputError(
-                f"Gibbs() keeps draws of states up to {NUMBERS:,} numbers, {self.chains} x {self.draws} draws of"
-                f" {problem.model.state_size} states are more: take fewer draws, or leave save out (means and sds are"
-                " always there)"
-            )
-
-
 @dataclass(eq=False)
 class GibbsChains(Chains):
     """All chains, one after the other: a library of sparse factors keeps one at a time, and takes all processors for
@@ -308,6 +259,52 @@ class GibbsChains(Chains):
             "density": np.array(value),
         }
         return Draw(**fields | {"states": self._states(at), "stats": {"acceptance_rate": np.array(chain.rate)}})
+
+
+@dataclass(frozen=True)
+class Gibbs(Sampler):
+    """Exact posterior of biases, hyper-parameters and trajectories, sampled together: for networks of any size.
+
+    Each sweep draws the hyper-parameters given the biases, and unknown levels and latent scales of
+    the noise given biases and trajectories; it solves for the Gaussian of all states and biases
+    given those, by sparse factors where the network is large, and moves these together by a
+    Hamiltonian quarter turn about its mean, which splits off the Gaussian (Shahbaba and others
+    2014): an independent draw where the model is linear, elsewhere kicked as often as it takes to be
+    accepted. Any prior with a density.
+    Of more than four million numbers no draws of states are kept, their means and sds are. Chains
+    run one after the other; biases and tracks start at draws under the declared scales, on the side
+    of a mirror that fits best. They do not visit the others, which the answer names. Draws that
+    have not mixed are made anew with 4 times as many sweeps from one to the next, up to `patience`.
+    Raises `InputError` for less than one chain or draw.
+    """
+
+    chains: int = 4
+    warmup: int = 50
+    draws: int = 250
+    patience: int = 4
+
+    name: ClassVar[str] = "Gibbs"
+    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
+    work = GibbsChains
+    chunk: ClassVar[int] = 25
+    engined: ClassVar[bool] = True
+    refusal: ClassVar[str] = (
+        "turns: the posterior is too far from the Gaussian of its linearised rows; take collapsed or nuts, of fewer"
+        " sensors where these do not fit"
+    )
+
+    def keeps_states(self, model: Model) -> bool:
+        """Whether draws of all states are few enough to be kept."""
+        return self.chains * self.draws * model.state_size <= NUMBERS
+
+    def check_kept(self, problem: Problem, keep: tuple[str, ...]) -> None:
+        """Raise `InputError` where draws of states are asked for that would take too much room."""
+        if {"states", "replicas"} & set(keep) and not self.keeps_states(problem.model):
+            raise InputError(
+                f"Gibbs() keeps draws of states up to {NUMBERS:,} numbers, {self.chains} x {self.draws} draws of"
+                f" {problem.model.state_size} states are more: take fewer draws, or leave save out (means and sds are"
+                " always there)"
+            )
 
 
 def gibbs_chains(

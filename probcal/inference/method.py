@@ -108,6 +108,7 @@ class Method(ABC):
     name: ClassVar[str]
     priors: ClassVar[tuple[type, ...]]  # the first is its own
     intervals: ClassVar[str]  # what the intervals are worth
+    work: ClassVar[type[MethodTask]]  # what it does on a problem, where `task` does not choose
     climbs: ClassVar[bool] = True  # to a mode; others start at the joint mode where noise levels are unknown
     engined: ClassVar[bool] = False  # whether it asks the engine that suits the size, and no other form
 
@@ -116,9 +117,9 @@ class Method(ABC):
         """Whether trajectories are particles, so that any motion will do and no start is needed."""
         return False
 
-    @abstractmethod
     def task(self, problem: Problem, prior: Prior, start: Point, context: Context) -> MethodTask:
         """The work of the method on a problem, from a start."""
+        return self.work(self, problem, prior, start, context)
 
     def answer(self, problem: Problem, prior: Prior, start: Point, context: Context) -> Answer:
         """Solve a problem from a start."""

@@ -50,7 +50,7 @@ SELDOM = 20.0  # times what a write took, until the next one at least
 
 
 class Storage:
-    """Parts of one run by number; in memory, or in a folder where `path` is given. Threads may add at once.
+    """Parts of one run by number, in the folder `path`; none are kept where there is no path. Threads may add at once.
 
     `resume` takes up what the folder holds, `overwrite` replaces it. Raises `InputError` where the folder holds a run
     and neither is given, where its run is another, where a part is damaged, and where another process works there.
@@ -65,7 +65,6 @@ class Storage:
         self.kind, self.identity = kind, dict(identity)
         self.digest = digest_of(kind, identity)
         self._numbers: set[int] = set()
-        self._parts: dict[int, dict[str, np.ndarray]] = {}  # of a run in memory
         self._lock: Lock | None = None
         self._loops = 0  # begun so far, of a fit whose loops are kept
         if self.path is None:
@@ -118,8 +117,6 @@ class Storage:
 
     def read(self, number: int) -> dict[str, np.ndarray]:
         """Arrays of one part by name; raises `InputError` where its file is missing, damaged or another's."""
-        if self.path is None:
-            return self._parts[number]
         file = self._file(number)
         remedy = f"delete it{self._later} and --resume (resume=True) makes it anew, or {OVERWRITE}"
         if not file.is_file():
@@ -150,12 +147,9 @@ class Storage:
 
     def add(self, number: int, arrays: Arrays) -> None:
         """Keep a part: its arrays by name."""
-        values = {name: np.asarray(value) for name, value in arrays.items()}
-        if self.path is None:
-            self._parts[number] = values
-        else:
+        if self.path is not None:
             content = io.BytesIO()
-            marked: dict[str, Any] = values | {"probcal": np.array(self._mark(number))}
+            marked: dict[str, Any] = {**arrays, "probcal": np.array(self._mark(number))}
             np.savez(content, **marked)
             write_whole(self._file(number), content.getbuffer())
         self._numbers.add(number)

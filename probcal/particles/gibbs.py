@@ -18,7 +18,6 @@ import numpy as np
 
 from probcal import linalg
 from probcal.errors import InputError
-from probcal.gaussian.mode import Point
 from probcal.inference.chains import Draw, Sample
 from probcal.inference.draws import slice_step
 from probcal.inference.em import EM
@@ -70,158 +69,6 @@ class Held(NamedTuple):
     group: jax.Array  # (M,) biases of one group share a row, or the prior ties them
     reference: jax.Array  # (M, M) information about the biases at given paths, by which steps of a sensor are scaled
     of_sensor: tuple[jax.Array, ...]  # (S,) group of each sensor of each block, one more than there are for none
-
-
-@dataclass(frozen=True)
-class ParticleGibbs(Sampler):
-    """Exact posterior of biases, hyper-parameters and trajectories for any motion, by particle Gibbs.
-
-    A sweep draws every path anew by a conditional filter of `particles` with ancestor sampling, then takes `steps` of
-    the biases at given paths: of all together, by Gauss-Newton proposals, and of each sensor by itself, near and far,
-    which given the paths knows nothing of the others. The motion needs a density. Draws that
-    have not mixed are made anew with 4 times as many sweeps from one to the next, up to `patience`. Raises
-    `InputError` for settings outside their ranges.
-    """
-
-    chains: int = 4
-    warmup: int = 200
-    draws: int = 500
-    particles: Particles = CONDITIONAL
-    steps: int = 40
-    patience: int = 16
-
-    name: ClassVar[str] = "ParticleGibbs"
-    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
-    chunk: ClassVar[int] = 25
-
-    def __post_init__(self):
-        super().__post_init__()
-        if not isinstance(self.particles, Particles):
-            raise InputError(f"ParticleGibbs(particles={self.particles!r}): give settings such as Particles(200)")
-        for name, value in (("steps", self.steps), ("patience", self.patience)):
-            if value < 1:
-                raise InputError(f"ParticleGibbs({name}={value}): it must be at least 1")
-
-    @property
-    def by_particles(self) -> bool:
-        """Trajectories are particles."""
-        return True
-
-    def kernel(self) -> ParticleGibbs:
-        """The method whatever the number of its chains and draws."""
-        return replace(self, chains=1, warmup=0, draws=1, patience=1)
-
-    def task(self, problem: Problem, prior: Prior, start: Point, context: Context) -> ParticleChains:
-        """Draws of the posterior from biases of a start, zero for a search."""
-        return ParticleChains(self, problem, prior, start, context)
-
-    def step(self, form: Form, posed: Any, chain: GibbsState) -> tuple[GibbsState, Sample]:
-        """One sweep; `posed` is what is `Held`."""
-        held: Held = posed
-        model, M = held.model, form.biases
-        key, *keys = jax.random.split(chain.key, 5)
-        z, levels = chain.theta[:M], chain.theta[M:]
-        paths, renewed = [], []
-        for r, (own, old) in enumerate(zip(held.targets, chain.paths, strict=True)):
-            seeds = jax.random.split(jax.random.fold_in(keys[0], r), len(own.there))
-
-            def one(epochs: Any, there: Any, path: Any, k: Any, own: Targets = own) -> Any:
-                return conditional_path(own.model, epochs, there, (path,), z, levels, k, self.particles)
-
-            (new,), moved = jax.vmap(one)(own.epochs, own.there, old, seeds)
-            paths.append(new)
-            renewed.append(jnp.sum(moved & own.there) / jnp.sum(own.there))
-        at = states_of(held, tuple(paths))
-        theta, rate = self._moved(form, held, at, chain.theta, chain.phi, keys[1])
-        theta = self._levels(form, held, at, tuple(paths), theta, keys[2])
-        phi, learnt = chain.phi, jnp.asarray(form.hierarchy.learnt, int)
-        for k, update in enumerate(form.hierarchy.updates()):
-            phi = update(phi, theta[learnt], jax.random.fold_in(keys[3], k))
-        told = sum(jnp.sum(part) for part in model.log_likelihood(At(at, theta[:M], theta[M:])))
-        joint = told + log_motion_of(held.targets, tuple(paths), theta[M:])
-        stats = {"acceptance_rate": rate, "renewed": jnp.mean(jnp.stack(renewed))}
-        return GibbsState(theta, phi, tuple(paths), key), Sample(theta, (), phi, joint, stats)
-
-    def _moved(
-        self, form: Form, held: Held, at: Any, theta: jax.Array, phi: Phi, key: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Steps of the biases at given paths, and the share of them taken.
-
-        A proposal is a shorter or longer part of a draw from the Gaussian of a Gauss-Newton step: for a linear sensor
-        it is always taken.
-        """
-        M, levels = form.biases, theta[form.biases :]
-        alpha, coupling = prior_precision(form, held.natural, phi)
-        prior = (jnp.diag(alpha) + coupling)[:M, :M]
-
-        def place(z: jax.Array) -> tuple[jax.Array, ...]:
-            point = At(at, z, levels)
-            told = sum(jnp.sum(part) for part in held.model.log_likelihood(point))
-            information, score = held.model.of_biases(held.model.linearise_biases(point, expected=True))
-            lower, inverse = linalg.factor_and_inverse(information + prior)
-            slope = score - prior @ z
-            return told - 0.5 * z @ prior @ z, inverse.T @ (inverse @ slope), lower, inverse
-
-        def log_proposal(here: tuple[jax.Array, ...], z: jax.Array, other: jax.Array, length: Any) -> jax.Array:
-            white = here[2].T @ (other - z - (1 - jnp.sqrt(1 - length**2)) * here[1]) / length
-            return jnp.sum(jnp.log(jnp.diagonal(here[2]))) - 0.5 * jnp.sum(white**2)
-
-        def together(carry: Any, inputs: Any) -> tuple[Any, jax.Array]:
-            z, here = carry
-            own, length = inputs
-            seeds = jax.random.split(own)
-            noise = here[3].T @ jax.random.normal(seeds[0], z.shape)
-            other = z + (1 - jnp.sqrt(1 - length**2)) * here[1] + length * noise
-            there = place(other)
-            gain = there[0] - here[0] + log_proposal(there, other, z, length) - log_proposal(here, z, other, length)
-            taken = jnp.log(jax.random.uniform(seeds[1])) < jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
-            return jax.tree.map(lambda new, old: jnp.where(taken, new, old), (other, there), (z, here)), taken
-
-        groups = form.biases + 1  # at most, and one for the rows of sensors without bias
-
-        def values(z: jax.Array) -> jax.Array:
-            """Log density of each group."""
-            total = jnp.zeros(groups).at[held.group].add(-0.5 * z * (prior @ z))
-            told = held.model.log_likelihood(At(at, z, levels))
-            for _, data, _, part, own in held.model.each_block(told, held.of_sensor):
-                total = total.at[own[data.sensor]].add(jnp.sum(part, 1))
-            return total
-
-        def apart(carry: Any, own: jax.Array) -> tuple[Any, jax.Array]:
-            z, here = carry
-            seeds = jax.random.split(own, 3)
-            span = jnp.log(NEAR) + (jnp.log(FAR) - jnp.log(NEAR)) * jax.random.uniform(seeds[0], (groups,))
-            other = z + jnp.exp(span)[held.group] * (spread.T @ jax.random.normal(seeds[1], z.shape))
-            there = values(other)
-            gain = jnp.where(jnp.isfinite(there), there - here, -jnp.inf)
-            taken = jnp.log(jax.random.uniform(seeds[2], (groups,))) < gain
-            found = (jnp.where(taken[held.group], other, z), jnp.where(taken, there, here))
-            return found, jnp.mean(taken[held.group])
-
-        seeds, z = jax.random.split(key, 3), theta[:M]
-        lengths = jnp.asarray(LENGTHS)
-        (z, _), taken = jax.lax.scan(together, (z, place(z)), (jax.random.split(seeds[0], len(LENGTHS)), lengths))
-        # by a factor that no draw of the biases moves, so that a step is as likely as its way back
-        spread = linalg.factor_and_inverse(held.reference + prior)[1]
-        (z, _), _ = jax.lax.scan(apart, (z, values(z)), jax.random.split(seeds[1], self.steps))
-        return theta.at[:M].set(z), jnp.mean(taken)
-
-    def _levels(
-        self, form: Form, held: Held, at: Any, paths: tuple[Any, ...], theta: jax.Array, key: jax.Array
-    ) -> jax.Array:
-        """Unknown noise levels at given paths and biases, one after the other."""
-        M, model = form.biases, held.model
-
-        def density(h: int, theta: jax.Array, value: jax.Array) -> jax.Array:
-            levels = theta[M:].at[h].set(value)
-            told = sum(jnp.sum(part) for part in model.log_likelihood(At(at, theta[:M], levels)))
-            motion = log_motion_of(held.targets, paths, levels) if model.driven else 0.0
-            return told + motion - 0.5 * (value / model.level_spread[h]) ** 2
-
-        for h in range(model.level_spread.shape[0]):
-            value = slice_step(jax.random.fold_in(key, h), theta[M + h], partial(density, h, theta))
-            theta = theta.at[M + h].set(value)
-        return theta
 
 
 def groups_of(model: Model, coupling: np.ndarray) -> tuple[jax.Array, tuple[jax.Array, ...]]:
@@ -335,6 +182,155 @@ class ParticleChains(Chains):
         renewed = (share,) if share < STUCK else ()
         of_run = partial(particle_chains, paths=self.paths)
         return conclude_draws(solved, self.prior, run, of_run, unexplained, renewed=renewed)
+
+
+@dataclass(frozen=True)
+class ParticleGibbs(Sampler):
+    """Exact posterior of biases, hyper-parameters and trajectories for any motion, by particle Gibbs.
+
+    A sweep draws every path anew by a conditional filter of `particles` with ancestor sampling, then takes `steps` of
+    the biases at given paths: of all together, by Gauss-Newton proposals, and of each sensor by itself, near and far,
+    which given the paths knows nothing of the others. The motion needs a density. Draws that
+    have not mixed are made anew with 4 times as many sweeps from one to the next, up to `patience`. Raises
+    `InputError` for settings outside their ranges.
+    """
+
+    chains: int = 4
+    warmup: int = 200
+    draws: int = 500
+    particles: Particles = CONDITIONAL
+    steps: int = 40
+    patience: int = 16
+
+    name: ClassVar[str] = "ParticleGibbs"
+    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
+    work = ParticleChains
+    chunk: ClassVar[int] = 25
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not isinstance(self.particles, Particles):
+            raise InputError(f"ParticleGibbs(particles={self.particles!r}): give settings such as Particles(200)")
+        for name, value in (("steps", self.steps), ("patience", self.patience)):
+            if value < 1:
+                raise InputError(f"ParticleGibbs({name}={value}): it must be at least 1")
+
+    @property
+    def by_particles(self) -> bool:
+        """Trajectories are particles."""
+        return True
+
+    def kernel(self) -> ParticleGibbs:
+        """The method whatever the number of its chains and draws."""
+        return replace(self, chains=1, warmup=0, draws=1, patience=1)
+
+    def step(self, form: Form, posed: Any, chain: GibbsState) -> tuple[GibbsState, Sample]:
+        """One sweep; `posed` is what is `Held`."""
+        held: Held = posed
+        model, M = held.model, form.biases
+        key, *keys = jax.random.split(chain.key, 5)
+        z, levels = chain.theta[:M], chain.theta[M:]
+        paths, renewed = [], []
+        for r, (own, old) in enumerate(zip(held.targets, chain.paths, strict=True)):
+            seeds = jax.random.split(jax.random.fold_in(keys[0], r), len(own.there))
+
+            def one(epochs: Any, there: Any, path: Any, k: Any, own: Targets = own) -> Any:
+                return conditional_path(own.model, epochs, there, (path,), z, levels, k, self.particles)
+
+            (new,), moved = jax.vmap(one)(own.epochs, own.there, old, seeds)
+            paths.append(new)
+            renewed.append(jnp.sum(moved & own.there) / jnp.sum(own.there))
+        at = states_of(held, tuple(paths))
+        theta, rate = self._moved(form, held, at, chain.theta, chain.phi, keys[1])
+        theta = self._levels(form, held, at, tuple(paths), theta, keys[2])
+        phi, learnt = chain.phi, jnp.asarray(form.hierarchy.learnt, int)
+        for k, update in enumerate(form.hierarchy.updates()):
+            phi = update(phi, theta[learnt], jax.random.fold_in(keys[3], k))
+        told = sum(jnp.sum(part) for part in model.log_likelihood(At(at, theta[:M], theta[M:])))
+        joint = told + log_motion_of(held.targets, tuple(paths), theta[M:])
+        stats = {"acceptance_rate": rate, "renewed": jnp.mean(jnp.stack(renewed))}
+        return GibbsState(theta, phi, tuple(paths), key), Sample(theta, (), phi, joint, stats)
+
+    def _moved(
+        self, form: Form, held: Held, at: Any, theta: jax.Array, phi: Phi, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Steps of the biases at given paths, and the share of them taken.
+
+        A proposal is a shorter or longer part of a draw from the Gaussian of a Gauss-Newton step: for a linear sensor
+        it is always taken.
+        """
+        M, levels = form.biases, theta[form.biases :]
+        alpha, coupling = prior_precision(form, held.natural, phi)
+        prior = (jnp.diag(alpha) + coupling)[:M, :M]
+
+        def place(z: jax.Array) -> tuple[jax.Array, ...]:
+            point = At(at, z, levels)
+            told = sum(jnp.sum(part) for part in held.model.log_likelihood(point))
+            information, score = held.model.of_biases(held.model.linearise_biases(point, expected=True))
+            lower, inverse = linalg.factor_and_inverse(information + prior)
+            slope = score - prior @ z
+            return told - 0.5 * z @ prior @ z, inverse.T @ (inverse @ slope), lower, inverse
+
+        def log_proposal(here: tuple[jax.Array, ...], z: jax.Array, other: jax.Array, length: Any) -> jax.Array:
+            white = here[2].T @ (other - z - (1 - jnp.sqrt(1 - length**2)) * here[1]) / length
+            return jnp.sum(jnp.log(jnp.diagonal(here[2]))) - 0.5 * jnp.sum(white**2)
+
+        def together(carry: Any, inputs: Any) -> tuple[Any, jax.Array]:
+            z, here = carry
+            own, length = inputs
+            seeds = jax.random.split(own)
+            noise = here[3].T @ jax.random.normal(seeds[0], z.shape)
+            other = z + (1 - jnp.sqrt(1 - length**2)) * here[1] + length * noise
+            there = place(other)
+            gain = there[0] - here[0] + log_proposal(there, other, z, length) - log_proposal(here, z, other, length)
+            taken = jnp.log(jax.random.uniform(seeds[1])) < jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
+            return jax.tree.map(lambda new, old: jnp.where(taken, new, old), (other, there), (z, here)), taken
+
+        groups = form.biases + 1  # at most, and one for the rows of sensors without bias
+
+        def values(z: jax.Array) -> jax.Array:
+            """Log density of each group."""
+            total = jnp.zeros(groups).at[held.group].add(-0.5 * z * (prior @ z))
+            told = held.model.log_likelihood(At(at, z, levels))
+            for _, data, _, part, own in held.model.each_block(told, held.of_sensor):
+                total = total.at[own[data.sensor]].add(jnp.sum(part, 1))
+            return total
+
+        def apart(carry: Any, own: jax.Array) -> tuple[Any, jax.Array]:
+            z, here = carry
+            seeds = jax.random.split(own, 3)
+            span = jnp.log(NEAR) + (jnp.log(FAR) - jnp.log(NEAR)) * jax.random.uniform(seeds[0], (groups,))
+            other = z + jnp.exp(span)[held.group] * (spread.T @ jax.random.normal(seeds[1], z.shape))
+            there = values(other)
+            gain = jnp.where(jnp.isfinite(there), there - here, -jnp.inf)
+            taken = jnp.log(jax.random.uniform(seeds[2], (groups,))) < gain
+            found = (jnp.where(taken[held.group], other, z), jnp.where(taken, there, here))
+            return found, jnp.mean(taken[held.group])
+
+        seeds, z = jax.random.split(key, 3), theta[:M]
+        lengths = jnp.asarray(LENGTHS)
+        (z, _), taken = jax.lax.scan(together, (z, place(z)), (jax.random.split(seeds[0], len(LENGTHS)), lengths))
+        # by a factor that no draw of the biases moves, so that a step is as likely as its way back
+        spread = linalg.factor_and_inverse(held.reference + prior)[1]
+        (z, _), _ = jax.lax.scan(apart, (z, values(z)), jax.random.split(seeds[1], self.steps))
+        return theta.at[:M].set(z), jnp.mean(taken)
+
+    def _levels(
+        self, form: Form, held: Held, at: Any, paths: tuple[Any, ...], theta: jax.Array, key: jax.Array
+    ) -> jax.Array:
+        """Unknown noise levels at given paths and biases, one after the other."""
+        M, model = form.biases, held.model
+
+        def density(h: int, theta: jax.Array, value: jax.Array) -> jax.Array:
+            levels = theta[M:].at[h].set(value)
+            told = sum(jnp.sum(part) for part in model.log_likelihood(At(at, theta[:M], levels)))
+            motion = log_motion_of(held.targets, paths, levels) if model.driven else 0.0
+            return told + motion - 0.5 * (value / model.level_spread[h]) ** 2
+
+        for h in range(model.level_spread.shape[0]):
+            value = slice_step(jax.random.fold_in(key, h), theta[M + h], partial(density, h, theta))
+            theta = theta.at[M + h].set(value)
+        return theta
 
 
 def particle_chains(
