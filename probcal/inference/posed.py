@@ -121,24 +121,25 @@ def activity(form: Form, posed: Quadratic, phi: Phi) -> jax.Array:
     return jnp.concatenate([form.hierarchy.active(phi, form.biases), jnp.ones(H, bool)])
 
 
-def conditional(form: Form, posed: Quadratic, phi: Phi) -> Conditional:
-    """theta given phi, trajectories marginalised."""
+def natural(form: Form, posed: Quadratic, phi: Phi) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Precision (Q, Q) and pull (Q,) of theta given phi, what is active (Q,), and prior precisions (Q,)."""
     alpha, coupling = prior_precision(form, posed, phi)
     active = activity(form, posed, phi)
     matrix = posed.information + coupling + jnp.diag(alpha)
     matrix = jnp.where(active[:, None] & active[None, :], matrix, jnp.eye(alpha.shape[0]))
-    pull = jnp.where(active, posed.pull, 0.0)
+    return matrix, jnp.where(active, posed.pull, 0.0), active, alpha
+
+
+def conditional(form: Form, posed: Quadratic, phi: Phi) -> Conditional:
+    """theta given phi, trajectories marginalised."""
+    matrix, pull, active, alpha = natural(form, posed, phi)
     factor, inverse = linalg.factor_and_inverse(matrix)
     return Conditional(inverse.T @ (inverse @ pull), factor, inverse, active, alpha)
 
 
 def draw_given(form: Form, posed: Quadratic, phi: Phi, key: jax.Array) -> jax.Array:
     """One draw (Q,) of theta given phi: that of `conditional`, without the inverse."""
-    alpha, coupling = prior_precision(form, posed, phi)
-    active = activity(form, posed, phi)
-    matrix = posed.information + coupling + jnp.diag(alpha)
-    matrix = jnp.where(active[:, None] & active[None, :], matrix, jnp.eye(alpha.shape[0]))
-    pull = jnp.where(active, posed.pull, 0.0)
+    matrix, pull, active, _ = natural(form, posed, phi)
     return jnp.where(active, linalg.displace(matrix, pull, jax.random.normal(key, pull.shape)), 0.0)
 
 

@@ -18,9 +18,10 @@ import numpy as np
 
 from probcal import linalg
 from probcal.errors import InputError
-from probcal.inference.chains import Draw, Sample
+from probcal.inference.chains import Draw, Sample, repeated
 from probcal.inference.draws import slice_step
 from probcal.inference.em import EM
+from probcal.inference.gibbs import draw_hyper
 from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.method import Context
 from probcal.inference.posed import Form, Natural, conditional, log_prior, prior_precision
@@ -101,12 +102,9 @@ def states_of(held: Held, paths: tuple[Any, ...]) -> tuple[Any, ...]:
 @partial(jax.jit, static_argnames=("method", "form"))
 def run_particle_sweeps(method: ParticleGibbs, form: Form, held: Held, chain: GibbsState, thin: jax.Array) -> Any:
     """`method.chunk` draws of one chain, `thin` sweeps apart."""
-    blank = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(partial(method.step, form, held), chain)[1]
-    )
 
     def one(chain: GibbsState, _: None) -> tuple[GibbsState, Draw]:
-        chain, sample = jax.lax.fori_loop(0, thin, lambda _, both: method.step(form, held, both[0]), (chain, blank))
+        chain, sample = repeated(partial(method.step, form, held), chain, thin)
         M = form.biases
         given = conditional(form, held.natural, sample.phi)
         variance = given.variance[:M]
@@ -243,9 +241,7 @@ class ParticleGibbs(Sampler):
         at = states_of(held, tuple(paths))
         theta, rate = self._moved(form, held, at, chain.theta, chain.phi, keys[1])
         theta = self._levels(form, held, at, tuple(paths), theta, keys[2])
-        phi, learnt = chain.phi, jnp.asarray(form.hierarchy.learnt, int)
-        for k, update in enumerate(form.hierarchy.updates()):
-            phi = update(phi, theta[learnt], jax.random.fold_in(keys[3], k))
+        phi = draw_hyper(form, chain.phi, theta, keys[3])
         told = sum(jnp.sum(part) for part in model.log_likelihood(At(at, theta[:M], theta[M:])))
         joint = told + log_motion_of(held.targets, tuple(paths), theta[M:])
         stats = {"acceptance_rate": rate, "renewed": jnp.mean(jnp.stack(renewed))}
