@@ -65,9 +65,7 @@ class Damped(Iterated):
     name: ClassVar[str] = "damped"
     priors: ClassVar[tuple[type, ...]] = (pc.Gaussian, pc.Flat)
     intervals: ClassVar[str] = "Laplace"
-
-    def task(self, *given):
-        return DampedClimb(self, *given)
+    work = DampedClimb
 
 
 @pytest.fixture(scope="module")
