@@ -16,8 +16,8 @@ import numpyro.distributions as dist
 import pytest
 
 from probcal import NUTS, SVI, BernoulliGaussian, Collapsed, Horseshoe
+from probcal.inference.method import Context
 from probcal.inference.mixed import mixing
-from probcal.inference.sampling import sample
 from probcal.modes import automatic_start
 from probcal.types import float64
 
@@ -43,7 +43,9 @@ def posed():
 
 @float64
 def drawn(problem, start, method, prior, seed):
-    return sample(problem, method, prior, start, jax.random.key(seed))
+    context = Context(jax.random.key(seed))
+    task = method.task(problem, prior, start, context)
+    return task.run(context.run(task)[1])
 
 
 @pytest.mark.parametrize("name", list(METHODS))

@@ -227,7 +227,7 @@ MUTATIONS = [
     Mutation("found |= own[0] if own else {}", "pass", "test_model.py"),
     Mutation(" - 0.5 * np.log(2 * np.pi) * normal", "", "test_svi.py"),
     Mutation("min((chunk - self.begin + 1) * size", "min((chunk - self.begin) * size", "test_mixing.py"),
-    Mutation("self.storage.numbers[first:last])", "self.storage.numbers[first:last][:-1] or self.storage.numbers)", "test_storage.py"),
+    Mutation('self.found = numbered(part, "state"), chunks', 'self.found = numbered(part, "state"), chunks[:-1]', "test_storage.py"),
     # analysis/
     Mutation("(not status.settled, ", "(status is Status.DIVERGED, ", "test_guards.py"),
     Mutation("(gamma + inflation * (1.0 - gamma))", "gamma", "test_assess.py"),
