@@ -265,7 +265,7 @@ def test_every_mutation_still_has_its_line():
 
 
 BY_MODULE = {  # names that a reader meets behind their module: `rows.predict`, `cli.fit.run`
-    "log_likelihood", "predict", "run", "sample", "slopes",
+    "log_likelihood", "predict", "run", "slopes",
 }  # fmt: skip
 
 

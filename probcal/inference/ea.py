@@ -168,7 +168,7 @@ class EA(Maximiser):
         return prior.hierarchical if self.precisions == "integrated" else isinstance(prior, ARD)
 
     def further(self, task: KernelClimb, state: State, course: Trace) -> tuple[State, Trace]:
-        """Where precisions are maximised, the state of climbs again, without biases that another mode keeps in."""
+        """The end of climbs again where precisions are maximised, without biases that another mode keeps in."""
         problem, prior, context = task.problem, task.prior, task.context
         if task.alpha is not None or not self._tries_again(prior):
             return state, course

@@ -161,15 +161,17 @@ class HostClimb(MethodTask):
             evidence=worth.value, lost=lost, stopped=context.monitor.stopped, refused=bool(state.refused),
         )  # fmt: skip
 
-    def recovered(self, error: MemoryError | np.linalg.LinAlgError) -> Answer:
+    def beyond_memory(self, error: MemoryError) -> Answer:
         """The answer without a factor where memory does not hold one; raises what to do where there is none."""
         method, engine, prior = self.method, self.engine, self.prior
-        if isinstance(error, np.linalg.LinAlgError):
-            raise diverged(self.problem, engine.at(self.model, self.start), self.factors) from None
         if not (engine.exact and method.engine == "auto" and isinstance(prior, (Gaussian, Flat))):
             raise _memory(engine, self.model) from None
         other = replace(method, engine="iterative")
         return cast("Answer", other.answer(self.problem, prior, self.start, self.context))
+
+    def singular(self, error: np.linalg.LinAlgError) -> Answer:
+        """Raises that the fit diverged, and which biases no row informs."""
+        raise diverged(self.problem, self.engine.at(self.model, self.start), self.factors) from None
 
 
 def _memory(engine: Engine, model: Model) -> FitError:

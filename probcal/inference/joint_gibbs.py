@@ -226,17 +226,19 @@ class GibbsChains(Chains):
         return chain._replace(at=at, levels=levels, reference=reference, rest=rest)
 
     def outcome(self, state: SweepState, course: DrawnChunks) -> Answer:
-        """What draws of the biases and sums over sweeps say."""
+        """The answer by draws of the biases and sums over sweeps."""
         of_run = partial(gibbs_chains, runs=self, state=state)
         return conclude_draws(self.problem, self.prior, self.run(course), of_run)
 
-    def recovered(self, error: MemoryError | np.linalg.LinAlgError) -> Answer:
-        """Raises what to do without memory for a factor, or where the data leave a bias open."""
-        if isinstance(error, MemoryError):
-            raise FitError(
-                f"the factor of {self.model.state_size} state entries and {self.biases} biases does not fit in"
-                " memory: take fewer sensors or a shorter time"
-            ) from None
+    def beyond_memory(self, error: MemoryError) -> Answer:
+        """Raises what to do without memory for a factor."""
+        raise FitError(
+            f"the factor of {self.model.state_size} state entries and {self.biases} biases does not fit in"
+            " memory: take fewer sensors or a shorter time"
+        ) from None
+
+    def singular(self, error: np.linalg.LinAlgError) -> Answer:
+        """Raises what to do where the data leave a bias open."""
         if self.prior.proper:
             raise FitError(
                 "Gibbs: the precision under some draw of the hyper-parameters is singular in double precision:"

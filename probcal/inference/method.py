@@ -97,8 +97,12 @@ class MethodTask(Task):
     def outcome(self, state: Any, course: Any) -> Answer:
         """The answer of the last state and the course."""
 
-    def recovered(self, error: MemoryError | np.linalg.LinAlgError) -> Answer:
-        """The answer in another way after an error; raises it, or one that says what to do, where there is none."""
+    def beyond_memory(self, error: MemoryError) -> Answer:
+        """The answer in another way; raises the error, or one that says what to do, where there is none."""
+        raise error
+
+    def singular(self, error: np.linalg.LinAlgError) -> Answer:
+        """The same where some matrix is not positive definite."""
         raise error
 
 
@@ -126,8 +130,10 @@ class Method(ABC):
         task = self.task(problem, prior, start, context)
         try:
             return task.outcome(*context.run(task))
-        except (MemoryError, np.linalg.LinAlgError) as error:
-            return task.recovered(error)
+        except MemoryError as error:
+            return task.beyond_memory(error)
+        except np.linalg.LinAlgError as error:
+            return task.singular(error)
 
     def first_prior(self) -> Prior:
         """The prior where none is given."""

@@ -39,7 +39,7 @@ BFMI = 0.3  # below which the energy is not explored (Betancourt 2016)
 
 @dataclass(frozen=True, eq=False)
 class SamplerRun:
-    """What a sampler leaves: its draws, and how the run went."""
+    """The draws of a sampler, and how the run went."""
 
     method: Sampler
     asked: Sampler  # the method that was asked for, where another took over

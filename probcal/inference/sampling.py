@@ -181,7 +181,7 @@ class Chains(MethodTask):
             self.context.monitor.enter(phase, self.name, answering=phase != WARM_UP)
 
     def outcome(self, state: Any, course: DrawnChunks) -> Answer:
-        """What the draws say."""
+        """The answer by the draws."""
         return conclude_draws(self.problem, self.prior, self.run(course))
 
     def run(self, course: DrawnChunks) -> SamplerRun:

@@ -155,7 +155,7 @@ class Storage:
         self._numbers.add(number)
 
     def checkpoint(self, kind: str, first: Sequence[Any]) -> Checkpoint | Chunks | None:
-        """What keeps the next loop of a kind, whose first state has these leaves; None where it is not kept."""
+        """The keeper of the next loop of a kind, whose first state has these leaves; None where it is not kept."""
         if self.path is None or self.kind != kind:
             return None
         if kind == "draws":

@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal import linalg
+from probcal.gaussian.mode import Point
 from probcal.gaussian.search import halved
+from probcal.inference.em import EM
 from probcal.inference.loop import Pause, Trace
-from probcal.inference.method import Given, MethodTask
+from probcal.inference.method import Context, Given, MethodTask
 from probcal.inference.run import bare, check_method, given_of, learn
 from probcal.model.model import At, Model
 from probcal.particles.ensemble import (
@@ -31,7 +33,7 @@ from probcal.particles.ensemble import (
 from probcal.particles.settings import ParticleSettings
 from probcal.particles.targets import Targets, weigh_rows
 from probcal.particles.weighted import Ended, check_learnt, conclude_particles, prepared
-from probcal.priors import Precision, Prior
+from probcal.priors import Gaussian, Precision, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 
@@ -216,6 +218,14 @@ class ParticleClimb(MethodTask):
         ended = Ended(state.z, state.levels, state.alpha, course, still.still, _moved(self.problem, still), stopped)
         own, key = (self.problem, self.method, self.how, self.prior), jax.random.split(self.context.key)[1]
         return conclude_particles(*own, self.given, self.targets, ended, key)
+
+
+def searched(problem: Problem, how: Any, start: Point, iterations: int, key: jax.Array) -> Climb:
+    """The state after some iterations from the biases of a start, of unit scales: a start for a sampler."""
+    context = Context(key)
+    task = ParticleClimb(EM(how, iterations, 0.0), problem, Gaussian(), start, context, how, key)
+    state: Climb = context.run(task)[0]
+    return state
 
 
 @partial(jax.jit, static_argnames="how")

@@ -20,10 +20,8 @@ from probcal import linalg
 from probcal.errors import InputError
 from probcal.inference.chains import Draw, Sample, repeated
 from probcal.inference.draws import slice_step
-from probcal.inference.em import EM
 from probcal.inference.gibbs import draw_hyper
 from probcal.inference.hierarchy import Phi, hierarchy_of
-from probcal.inference.method import Context
 from probcal.inference.posed import Form, Natural, conditional, log_prior, prior_precision
 from probcal.inference.posterior import SamplerRun, chains, conclude_draws
 from probcal.inference.sampler import Sampler
@@ -32,13 +30,13 @@ from probcal.linalg import invert, without_negative
 from probcal.model.model import At, Model, Recursion
 from probcal.modes.grid import follow_states, track_mode
 from probcal.particles.conditional import conditional_path
-from probcal.particles.em import ParticleClimb
+from probcal.particles.em import searched
 from probcal.particles.ensemble import ensemble, expected_over_paths, first_paths, log_motion_of, state_moments
 from probcal.particles.particles import Particles
 from probcal.particles.proposals import check_proposal
 from probcal.particles.targets import Targets, place_by_epoch
 from probcal.particles.weighted import Paths, check_learnt, louis, prepared, unexplained
-from probcal.priors import Gaussian, Horseshoe, Prior
+from probcal.priors import Horseshoe, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, Posterior
 
@@ -147,9 +145,7 @@ class ParticleChains(Chains):
         crowd = replace(particles, count=max(particles.count, CROWD), smoother="backward")
         z, levels = np.asarray(self.start.z), np.zeros(len(problem.levels))
         if not z.any():  # a sweep goes where the last path was: chains are begun where the data may be explained
-            alone = Context(keys[3])
-            search = ParticleClimb(EM(crowd, SEARCH, 0.0), problem, Gaussian(), self.start, alone, crowd, keys[3])
-            begun = alone.run(search)[0]
+            begun = searched(problem, crowd, self.start, SEARCH, keys[3])
             z, levels = np.asarray(begun.z), np.asarray(begun.levels)
         self.paths = Paths(problem, crowd, targets)
         told = louis(self.paths, z, levels, keys[0])
@@ -173,7 +169,7 @@ class ParticleChains(Chains):
         return each_chain(lambda own: run_particle_sweeps(method, form, self.held, own, sweeps), state, chains, threads)
 
     def outcome(self, state: GibbsState, course: DrawnChunks) -> Answer:
-        """What the draws say, and whether paths were renewed."""
+        """The answer by the draws, and whether paths were renewed."""
         run, problem = self.run(course), self.problem
         linear = all(part is None for part in problem.model.sampled)
         share, solved = float(np.mean(run.draws.stats["renewed"])), problem if linear else problem.seen()
