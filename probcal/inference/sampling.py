@@ -23,7 +23,7 @@ from probcal.inference.pose import Worth
 from probcal.inference.posed import Form, Natural, Posed
 from probcal.inference.posterior import SamplerRun, conclude_draws, side_of_draws
 from probcal.inference.progress import Monitor
-from probcal.inference.sampler import Sampler
+from probcal.inference.sampler import DRAWS, Sampler
 from probcal.modes.explore import Mirrored
 from probcal.results.answer import Answer
 
@@ -116,6 +116,7 @@ class Chains(MethodTask):
     """
 
     kind: ClassVar[str] = "draws"
+    iterations: ClassVar[int] = DRAWS  # more chunks than any plan has: `ended` knows the last
 
     sides: tuple[Mirrored, ...] = ()  # other sides of a mirror that they visit
     worth: Worth | None = None
@@ -127,14 +128,6 @@ class Chains(MethodTask):
 
     def __post_init__(self) -> None:
         self.asked, self.began = self.method, time.perf_counter()
-
-    @property
-    def iterations(self) -> int:
-        """Chunks where draws never mix."""
-        plan = Plan(self.method)
-        while not plan.last:
-            plan = plan.longer()
-        return plan.end
 
     @abstractmethod
     def advance(self, state: Any, thin: int) -> tuple[Any, Draw]:
