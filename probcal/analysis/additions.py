@@ -204,7 +204,7 @@ def _of_some(
     (epochs,) = passes.epochs  # all are alike
     which = np.searchsorted(some, [int(label.partition(" ")[2]) for label in epochs.target])
     k = np.searchsorted(instants, epochs.time) if states.shape[1] > 1 else np.zeros(len(which), int)
-    along = jnp.asarray(states[some[which], k])
+    along = jax.device_put(states[some[which], k])
     pieces = [which[np.asarray(epoch)] for epoch in passes.model.epoch]
     model, read = variants.of_read(variants.split(passes.model.by_information(), pieces, len(some)))
     owner, bias = np.divmod(read, M)
@@ -247,7 +247,7 @@ def gains_of_sensors(told: Informed, kind: SensorType, places: np.ndarray) -> np
     model, gains = wider.model.by_information(), np.zeros(len(places))
     engine, scales, own = choose(model), Factors.alone(np.ones(len(old))), np.flatnonzero(old < 0)
     for k, place in enumerate(places):
-        moved = variants.placed(model, [jnp.asarray(mine) for mine in new], jnp.asarray(place))
+        moved = variants.placed(model, [jax.device_put(mine) for mine in new], jax.device_put(place))
         near = [away <= told.reach.get(kind, np.inf) for away in _away(wider, moved, point)]
         pairs = list(zip(new, near, strict=True))
         if not any(bool((mine & there).any()) for mine, there in pairs):
@@ -274,7 +274,7 @@ def _states_at(told: Informed, wider: Problem) -> tuple[jax.Array, ...]:
         for name, mine in epochs.members.items():
             time, own = known[name]
             states[mine] = own[np.minimum(np.searchsorted(time, epochs.time[mine]), len(time) - 1)]
-        found.append(jnp.asarray(states))
+        found.append(jax.device_put(states))
     return tuple(found)
 
 

@@ -44,7 +44,7 @@ def _stepped(at: Expansion, factors: Factors, held: np.ndarray, prior: Precision
     """
     z = np.asarray(at.point.z)
     pinned = factors + Factors.alone(np.where(held, PINNED, 0.0))
-    start = at.point._replace(z=jnp.asarray(np.where(held, 0.0, z)))
+    start = at.point._replace(z=jax.device_put(np.where(held, 0.0, z)))
     moved = at.moved(at.solve(pinned, np.asarray(at.slope()) + pinned.pull(z)))
     least, square = _ends(at.model, at.point, start, moved, prior, at.rows)
     volume = at.log_det(pinned).value - np.count_nonzero(held) * np.log(PINNED) + float(at.eliminated.logdet)
@@ -77,7 +77,7 @@ class _Refits:
     def run(self, out: np.ndarray | None, alpha: np.ndarray, held: np.ndarray) -> tuple[float, float]:
         """Evidence and least squares without the rows (of the table) in `out`, at precisions alpha (M,)."""
         fit, model, point, at = self.fit, self.fit.problem.model, self.fit.point, self.fit.expansion
-        prior = fit.prior._replace(alpha=jnp.asarray(alpha))
+        prior = fit.prior._replace(alpha=jax.device_put(alpha))
         weights = None if out is None else [~out[index][:, None] for index in fit.problem.row_index]
         if not self.quick:
             model = model if weights is None else model.weighted(weights)
@@ -85,7 +85,7 @@ class _Refits:
                 point = smooth_tracks(model, point)
                 model = model.with_tilt(tilt_at(model, point))
             frozen = variants.without(model, held)
-            start = point._replace(z=jnp.asarray(np.where(held, 0.0, point.z)))
+            start = point._replace(z=jax.device_put(np.where(held, 0.0, point.z)))
             at = fit.engine.at(frozen, find_mode(frozen, start, prior, STEPS, TOLERANCE).point)
         elif weights is not None:
             at = at.weighed(tuple(jnp.asarray(own) for own in weights))

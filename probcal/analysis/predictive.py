@@ -81,7 +81,7 @@ def check_replicas(fit: Judged, drawn: FitDraws, key: jax.Array) -> Predictive:
     """P-values by sensor and channel, and kurtosis, at draws of a fit."""
     problem = fit.problem
     gaussian = all_gaussian(problem.model)
-    sensors = tuple(jnp.asarray(problem.measurements.sensor[index]) for index in problem.row_index)
+    sensors = tuple(jax.device_put(problem.measurements.sensor[index]) for index in problem.row_index)
     count = len(problem.network.sensors)
     found, fourth = _discrepancies(problem.model, fit.point.levels, drawn, sensors, count, key)
     kurtosis = np.zeros(len(fit.data)) if gaussian else exact_kurtosis(fit, fit.flat(fourth) - 3.0)
@@ -108,12 +108,12 @@ def draws_of(fit: Judged, tree: xr.DataTree, key: jax.Array) -> FitDraws:
     def thin(values: np.ndarray) -> Any:
         return values.reshape(total, *values.shape[2:])[chosen]
 
-    z = jnp.asarray(thin(posterior["bias"].values) / problem.scales)
+    z = jax.device_put(thin(posterior["bias"].values) / problem.scales)
     levels = jnp.broadcast_to(fit.point.levels, (most, len(problem.levels)))
     if "level" in posterior:
         levels = jnp.asarray(level_logs(problem.levels, thin(posterior["level"].values)))
     if any("state" not in track for track in tracked.values()):
-        states = tuple(map(jnp.asarray, draw(fit.expansion, z, levels, key).states))
+        states = tuple(map(jax.device_put, draw(fit.expansion, z, levels, key).states))
         return FitDraws(z, levels, states, None)
     states = tuple(jnp.asarray(thin(own)) for own in saved_states(problem, tracked))
     replicas = tree["posterior_predictive"].to_dataset()["y"] if "posterior_predictive" in tree.children else None

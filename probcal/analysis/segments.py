@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
@@ -207,7 +206,7 @@ class _Differences:
         model = self.fit.problem.model
         parts = model.each_block(self.fit.problem.row_index, model.read)
         return [
-            jnp.asarray(sum(times[own][:, [k]] * step[j][read] for k, j in enumerate(columns)))
+            jax.device_put(sum(times[own][:, [k]] * step[j][read] for k, j in enumerate(columns)))
             for *_, own, read in parts
         ]
 

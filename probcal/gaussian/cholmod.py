@@ -11,7 +11,6 @@ from typing import Any, ClassVar
 from weakref import WeakSet
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian.factor import Entries, Factor
@@ -40,7 +39,7 @@ class Cholmod(Factor):
         self._library, self._thread = _imported(), get_ident()
         self.places, self.values = places, values
         with _calling():
-            self._entries = tuple(jnp.asarray(part) for part in (places.row, places.column, values))
+            self._entries = tuple(jax.device_put(part) for part in (places.row, places.column, values))
         with self._counting:
             self._live.add(self)
         self._make()
@@ -64,7 +63,7 @@ class Cholmod(Factor):
 
     def _apply(self, right: np.ndarray, *modes: Any) -> np.ndarray:
         def ask(token: Any) -> np.ndarray:
-            found = jnp.asarray(right)
+            found = jax.device_put(right)
             for mode in modes:
                 found = self._library.solve_factor(token, found, mode)
             return np.asarray(found)

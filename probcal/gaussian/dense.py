@@ -95,7 +95,7 @@ class DenseExpansion:
 
     def log_det(self, factors: Factors) -> Estimate:
         """Log determinant of the precision of the biases."""
-        return Estimate(float(_solved(self._precision(factors)).log_determinant()))
+        return Estimate(float(_log_det(self._precision(factors))))
 
     def solve(self, factors: Factors, right: Any) -> np.ndarray:
         """Covariance of the biases times right, (M,) or (M, K)."""
@@ -111,7 +111,7 @@ class DenseExpansion:
 
     def moved(self, dz: Any) -> Point:
         """The point with the biases moved by dz (M,), all tracks following."""
-        return _moved(self.model, self.point, self.eliminated, jnp.asarray(dz))
+        return _moved(self.model, self.point, self.eliminated, jax.device_put(dz))
 
     def _precision(self, factors: Factors) -> np.ndarray:
         """The precision of the biases; what rounding leaves below zero is no information."""
@@ -189,6 +189,7 @@ class DenseExpansion:
 
 
 _solved = jax.jit(Dense.of)
+_log_det = jax.jit(lambda precision: Dense.of(precision).log_determinant())
 _moved = jax.jit(follow)
 
 

@@ -63,7 +63,7 @@ def draw(
     for k, start in enumerate(range(0, count, size)):
         chosen = np.minimum(np.arange(start, start + size), count - 1)  # the last pass is filled with its last draw
         seeds = jax.random.split(jax.random.fold_in(key, k))
-        mine = jnp.asarray(biases[chosen])
+        mine = jax.device_put(biases[chosen])
         states = draw_trajectories(at, mine, seeds[0])
         by_datum: tuple[Data, Data] = ((), ())
         if {"log_likelihood", "replicas"} & set(keep):

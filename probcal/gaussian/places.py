@@ -228,7 +228,7 @@ def _batches(arrays: list[np.ndarray]) -> Iterator[tuple[jax.Array, ...]]:
     """Arrays with the same number of rows in parts of `BATCH`, the last one filled up with zeros."""
     for k in range(0, len(arrays[0]), BATCH):
         own = [a[k : k + BATCH] for a in arrays]
-        yield tuple(jnp.asarray(np.concatenate([a, np.zeros((BATCH - len(a), *a.shape[1:]))])) for a in own)
+        yield tuple(jax.device_put(np.concatenate([a, np.zeros((BATCH - len(a), *a.shape[1:]))])) for a in own)
 
 
 def _first(model: Model, point: Point) -> tuple[np.ndarray, ...]:
@@ -274,7 +274,7 @@ def _curved(model: Model, point: Point, still: tuple[Still, ...]) -> tuple[Still
     for s, (_, log_w), (f, _, _), (top, _, _), poses in parts:
         off = np.abs(np.logaddexp.reduce(f[: len(log_w)] - top + log_w[:, None], axis=0))
         few = poses <= s.mean.shape[1] + FEW
-        chosen.append(s._replace(on=jnp.asarray(np.asarray(s.on) & (poses > 0) & (few | (off > OFF)))))
+        chosen.append(s._replace(on=jax.device_put(np.asarray(s.on) & (poses > 0) & (few | (off > OFF)))))
     return tuple(chosen)
 
 

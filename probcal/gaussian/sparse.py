@@ -173,7 +173,7 @@ class SparseExpansion:
 
     def moved(self, dz: Any) -> Point:
         """The point with the biases moved by dz (M,), all tracks following."""
-        return _followed(self.model, self.point, self.rows, self.eliminated, jnp.asarray(dz))
+        return _followed(self.model, self.point, self.rows, self.eliminated, jax.device_put(dz))
 
     def marginals(self, factors: Factors, members: np.ndarray) -> np.ndarray:
         """Covariances (B, p, p) of biases (B, p), M of none: 1 on its diagonal.
@@ -208,7 +208,7 @@ class SparseExpansion:
     def noises(self, factors: Factors) -> tuple[np.ndarray, ...]:
         """Variance (E, n) of every whitened noise of each recursion."""
         found = self.solved(factors)
-        steps = tuple(tuple(map(jnp.asarray, own)) for own in found.joint.steps(self.model, found.factor.inverse))
+        steps = tuple(tuple(map(jax.device_put, own)) for own in found.joint.steps(self.model, found.factor.inverse))
         variances = _noise_variances(self.model, self.point, steps)
         return self.model.each(lambda _, on, own: np.where(on[:, None], own, 1.0), self.joint.driven, variances)
 
@@ -230,8 +230,8 @@ class SparseExpansion:
         found, rng = self.solved(factors), np.random.default_rng(np.asarray(jax.random.key_data(key)))
         drawn = found.factor.draw(rng, count)
         padded = np.concatenate([drawn, np.zeros((count, 1))], 1)  # no variable: -1
-        states = tuple(jnp.asarray(padded[:, own]) for own in self.joint.slots)
-        return Sampled(jnp.asarray(drawn[:, self.joint.states :]), states)
+        states = tuple(jax.device_put(padded[:, own]) for own in self.joint.slots)
+        return Sampled(jax.device_put(drawn[:, self.joint.states :]), states)
 
     def followed(self, root: Any) -> list[np.ndarray]:
         """Variance (E, n) of every state where the biases have the covariance root root', root (M,

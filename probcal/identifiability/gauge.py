@@ -85,7 +85,7 @@ def held_states(problem: Problem) -> tuple[jax.Array, ...]:
                 if isinstance(component, Known):
                     here = np.ix_(mine, np.arange(own.start, own.stop))
                     precision[here] = np.minimum(1 / np.maximum(spread[here], 1 / HELD), HELD)
-        found.append(jnp.asarray(precision))
+        found.append(jax.device_put(precision))
     return tuple(found)
 
 
@@ -102,7 +102,7 @@ def gauge(problem: Problem, point: Point) -> Gauge:
     unit = 1 / np.sqrt(np.where(alone > 0, alone, 1.0))
     values, vectors = spectrum(information * np.outer(unit, unit))
     near = unit[:, None] * vectors[:, values < CLOSE]
-    found = within(model, lins, hold, jnp.asarray(near))
+    found = within(model, lins, hold, jax.device_put(near))
     exact = np.asarray(found.left) + near.T @ (survey[:, None] * near)
     values, turned = spectrum(0.5 * (exact + exact.T))
     return Gauge(orthogonalise(near @ turned[:, values < NULL]), _countable(problem, found.ranks))
@@ -110,7 +110,7 @@ def gauge(problem: Problem, point: Point) -> Gauge:
 
 def unfixed(problem: Problem, point: Point, vectors: np.ndarray) -> np.ndarray:
     """Which of some combinations (M, k) no row fixes: each by itself, where the biases are too many for `gauge`."""
-    found = within(problem.model, linearise_rows(problem.model, point), held_states(problem), jnp.asarray(vectors))
+    found = within(problem.model, linearise_rows(problem.model, point), held_states(problem), jax.device_put(vectors))
     survey = (problem.surveyed[:, None] * vectors**2).sum(0)
     left, known = np.diagonal(np.asarray(found.left)) + survey, np.asarray(found.known) + survey
     return (left < CLOSE * np.maximum(known, np.finfo(float).tiny)) & _countable(problem, found.ranks)

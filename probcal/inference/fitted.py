@@ -91,7 +91,7 @@ class Judged:
             return [jnp.zeros((M, 0))]
         chunk = max(min(COLUMNS, M), 1)
         root = np.pad(self.root, ((0, 0), (0, -M % chunk)))
-        return [jnp.asarray(part) for part in np.split(root, max(root.shape[1] // chunk, 1), axis=1)]
+        return [jax.device_put(part) for part in np.split(root, max(root.shape[1] // chunk, 1), axis=1)]
 
     def shared(self) -> np.ndarray | None:
         """Degrees of freedom that the biases took of each datum (D,), where no roots tell them.
@@ -169,8 +169,8 @@ def point_of(problem: Problem, fit: xr.DataTree, group: xr.Dataset) -> Point:
     point = follow_states(problem, saved)
     if problem.levels:
         level = fit["level"].to_dataset()
-        point = at_levels(problem.model, point, jnp.asarray(level_logs(problem.levels, level["std"].values)))
-    z = jnp.asarray(group["point" if "point" in group else "mean"].values / problem.scales)
+        point = at_levels(problem.model, point, jax.device_put(level_logs(problem.levels, level["std"].values)))
+    z = jax.device_put(group["point" if "point" in group else "mean"].values / problem.scales)
     return track_mode(problem, point._replace(z=z))
 
 
@@ -187,4 +187,4 @@ def _prior(group: xr.Dataset) -> Precision:
         for name in np.unique(first[value != 0]):
             members = np.flatnonzero(first == name)
             found.append((members, value[members[0]]))
-    return Precision.correlated(jnp.asarray(group["precision"].values), found)
+    return Precision.correlated(jax.device_put(group["precision"].values), found)

@@ -597,7 +597,7 @@ def drawn_precisions(prior: Prior, hierarchy: Hierarchy, hyper: Mapping[str, Any
     """
     if isinstance(prior, Flat) or prior.correlation or hierarchy.spiked or (hierarchy.learnt and not hyper):
         return None
-    alpha = _by_draw(hierarchy, dict(hyper), jnp.asarray(first)) if hyper else first
+    alpha = _by_draw(hierarchy, dict(hyper), jax.device_put(first)) if hyper else first
     return np.clip(np.asarray(alpha), LEAST, MOST)
 
 

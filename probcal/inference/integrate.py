@@ -119,7 +119,7 @@ def _by_batches(form: Form, model: Model, point: Point, known: Natural, chains: 
         if k + 1 >= FEWEST and max(np.max(mean_error, initial=0.0), np.max(sd_error, initial=0.0)) < CLOSE:
             break
     z, phi = jax.tree.map(lambda *parts: np.concatenate(parts, 1)[:, :: len(parts)], *kept)
-    middle = point_at(model, point, jnp.asarray(total.mean))
+    middle = point_at(model, point, jax.device_put(total.mean))
     return Integrated(middle, known.information, total, z, phi, True, mean_error, sd_error)
 
 

@@ -118,7 +118,7 @@ def draw_along(own: Posterior, key: jax.Array, keep: tuple[str, ...], z: np.ndar
     shape, M = z.shape[:2], z.shape[2]
     drawn: Any = ((), (), ())
     if keep:
-        drawn = draw(own.expansion, jnp.asarray(z.reshape(-1, M)), own.point.levels, key, keep)
+        drawn = draw(own.expansion, jax.device_put(z.reshape(-1, M)), own.point.levels, key, keep)
     states, likelihood, replicas = ([np.asarray(a).reshape(*shape, *a.shape[1:]) for a in part] for part in drawn)
     levels = np.broadcast_to(own.summary.levels, (*shape, len(own.summary.levels)))
     return Draws(z, levels, states, np.arange(shape[1]), likelihood, replicas)

@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian.draws import draws_a_chain, predictive
@@ -183,8 +182,8 @@ def mean_point(problem: Problem, run: SamplerRun) -> Point:
     side = heaviest(run)
     start = _framed(run) if side == 0 else run.sides[side - 1].point
     mine = run.side == side
-    start = at_levels(problem.model, start, jnp.asarray(run.levels[mine].mean(0)))
-    return track_mode(problem, start._replace(z=jnp.asarray(run.z[mine].mean(0))))
+    start = at_levels(problem.model, start, jax.device_put(run.levels[mine].mean(0)))
+    return track_mode(problem, start._replace(z=jax.device_put(run.z[mine].mean(0))))
 
 
 def values_by_datum(
@@ -198,7 +197,7 @@ def values_by_datum(
         return kept, [], []
 
     def flat(a: np.ndarray) -> jax.Array:
-        return jnp.asarray(a[:, kept].reshape(chains * len(kept), *a.shape[2:]))
+        return jax.device_put(a[:, kept].reshape(chains * len(kept), *a.shape[2:]))
 
     found = predictive(
         problem.model, flat(run.levels), flat(run.z), tuple(flat(s) for s in run.states), key, keep

@@ -186,7 +186,7 @@ def innovations(fit: Judged, kurtosis: np.ndarray, dz: np.ndarray | None = None)
     model = fit.problem.model
     filters, roots = prepare(fit.expansion.eliminated), fit.roots
     moved = np.zeros(model.biases + 1) if dz is None else np.append(dz, 0.0)
-    shift = [jnp.asarray(moved[np.asarray(read)]) for read in model.read]
+    shift = [jax.device_put(moved[np.asarray(read)]) for read in model.read]
     found = [_innovations(model, fit.point, fit.lins, filters, shift, part) for part in roots]
     value, _, kept = (fit.flat(parts) for parts in zip(*found[0], strict=True))
     used = np.sum([fit.flat([own for _, own, _ in part]) for part in found], axis=0)

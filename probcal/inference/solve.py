@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError, InputError
@@ -90,7 +89,7 @@ def solve_timed(
     if start is not None:
         points = [_suited(given, problem, start)]
     elif large:
-        points = [grid_start(problem, jnp.asarray(problem.first_z), 30)]
+        points = [grid_start(problem, jax.device_put(problem.first_z), 30)]
     else:
         points = [o.point for o in optima_of(problem, stopped=lambda: bool(monitor.stopped))]
     if method.engined:

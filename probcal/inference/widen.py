@@ -180,7 +180,7 @@ def _in_blocks(fit: Judged, values: np.ndarray) -> Data:
         block = np.zeros((*there.shape, values.shape[1]))
         block[pick] = values[start : start + len(pick[0])]
         start += len(pick[0])
-        found.append(jnp.asarray(block))
+        found.append(jax.device_put(block))
     return tuple(found)
 
 
@@ -201,7 +201,7 @@ def track_factors(
         biases = root @ rng.standard_normal((root.shape[1], COLUMNS))
         plain, shown = _noises(fit, rejected, rng)
         for sign, noise, moved in ((-1, plain, biases), (1, shown, wide[:, None] * biases)):
-            errors = _errors(model, fit.lins, fit.expansion.eliminated, noise, jnp.asarray(moved))
+            errors = _errors(model, fit.lins, fit.expansion.eliminated, noise, jax.device_put(moved))
             more = [own + sign * np.asarray(error) / chunks for own, error in zip(more, errors, strict=True)]
     dims, found, most = ("time", "component"), {}, before_data(model, fit.point.levels)
     for name, own in by_target(fit.problem, {"more": (dims, more), "most": (dims, most)}).items():

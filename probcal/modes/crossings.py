@@ -71,7 +71,7 @@ def crossed_nodes(problem: Problem, point: Point, most: float = np.inf) -> Itera
         for k in most_of:
             whole[own.of_node(k, len(z))] = settled[k]
         name = f"{len(most_of)} nodes elsewhere beside the paths that they hear"
-        yield Candidate(name, NODE, point._replace(z=jnp.asarray(whole)))
+        yield Candidate(name, NODE, point._replace(z=jax.device_put(whole)))
     for k in sorted(settled, key=lambda k: drop[k]):
         if drop[k] < min(WORSE * own.count[k], most):
             other = z.copy()
@@ -79,7 +79,7 @@ def crossed_nodes(problem: Problem, point: Point, most: float = np.inf) -> Itera
             now = node_places(problem, other)[names[k]]
             crossed = paths[k].distance(now) * paths[k].distance(place[names[k]]) < 0
             where = "on the other side of the path" if crossed else "elsewhere beside the path"
-            yield Candidate(f'node "{names[k]}" {where} that it hears', NODE, point._replace(z=jnp.asarray(other)))
+            yield Candidate(f'node "{names[k]}" {where} that it hears', NODE, point._replace(z=jax.device_put(other)))
 
 
 def _starts(
@@ -130,7 +130,8 @@ class _Own:
     def losses(self, model: Model, point: Point, z: np.ndarray) -> np.ndarray:
         """Cost (K,) of the data of each node and of its own biases under their scales."""
         found = [
-            np.nan_to_num(loss, nan=1e9, posinf=1e9) for loss in map(np.asarray, _by_row(model, point, jnp.asarray(z)))
+            np.nan_to_num(loss, nan=1e9, posinf=1e9)
+            for loss in map(np.asarray, _by_row(model, point, jax.device_put(z)))
         ]
         own = 0.5 * np.sum(np.append(z, 0.0)[self.biases] ** 2, 1)
         return own + _by_node(self.nodes, found, len(own))
@@ -149,7 +150,7 @@ class _Own:
         information: np.ndarray = np.eye(own.shape[1])
         for _ in range(STEPS):
             blocks, pull = np.tile(np.eye(own.shape[1]), (len(own), 1, 1)), -after
-            for read, lin in zip(model.read, _linearised(model, point, jnp.asarray(after[:-1])), strict=True):
+            for read, lin in zip(model.read, _linearised(model, point, jax.device_put(after[:-1])), strict=True):
                 on = np.flatnonzero((node[np.asarray(read)] >= 0).any(1))
                 read, slope, weight, score = (np.asarray(x)[on] for x in (read, lin.bias, lin.weight, lin.score))
                 np.add.at(pull, read, np.sum(score[:, :, None] * slope, 1))

@@ -29,7 +29,7 @@ def further_starts(problem: Problem, count: int, key: jax.Array) -> list[Point]:
     shape = (DRAWN * count, len(problem.labels))
     moved = np.asarray(jax.random.uniform(seeds[1], shape)) < SPARSE
     drawn = np.where(moved, 2.0 * np.asarray(jax.random.normal(seeds[2], shape)), 0.0)
-    points = [grid_start(problem, jnp.asarray(problem.first_z + z), 30) for z in np.concatenate([swaps, drawn])]
+    points = [grid_start(problem, jax.device_put(problem.first_z + z), 30) for z in np.concatenate([swaps, drawn])]
     flat = Precision(jnp.zeros(len(problem.labels)))
     costs = [float(joint_cost(problem.model, point, flat)) for point in points]
     value = np.nan_to_num(costs, nan=np.inf)

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from probcal.gaussian.choose import engine_of
@@ -46,7 +46,7 @@ def _losses(problem: Problem, z: np.ndarray, point: Point, plane: Plane | None) 
     found = []
     for r, place in enumerate(problem.positions(point.states)):
         place = place if plane is None else plane.across(place)
-        loss, _ = profile(problem.model, r, problem.epochs[r].position, jnp.asarray(z), jnp.asarray(place))
+        loss, _ = profile(problem.model, r, problem.epochs[r].position, jax.device_put(z), jax.device_put(place))
         found.append(np.nan_to_num(np.asarray(loss), nan=1e9, posinf=1e9))
     return found
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from probcal.gaussian.information import at_levels
@@ -157,7 +157,7 @@ def reflect(problem: Problem, point: Point, plane: Plane, chosen: Sequence[np.nd
                 vector = moved[mine, start:stop]
                 moved[mine, start:stop] = vector - 2.0 * (vector @ plane.normal)[:, None] * plane.normal
         tracks.append(moved)
-    return at_levels(problem.model, follow_states(problem, tracks)._replace(z=jnp.asarray(z)), point.levels)
+    return at_levels(problem.model, follow_states(problem, tracks)._replace(z=jax.device_put(z)), point.levels)
 
 
 def movable(problem: Problem) -> list[np.ndarray]:

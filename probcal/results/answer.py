@@ -13,7 +13,6 @@ from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian.choose import engine_of
@@ -201,7 +200,7 @@ class Posterior:
         if self.summary.kind != "mixture" or self.declared is not None:
             return self.summary.evidence
         prior = self.prior.precision(self.problem.labels, self.problem.surveyed)
-        alpha = jnp.asarray(self.summary.precision)
+        alpha = jax.device_put(self.summary.precision)
         with jax.enable_x64(True):
             return float(laplace(self.problem.model, self.point, prior._replace(alpha=alpha)).evidence)
 
@@ -305,4 +304,4 @@ class Answer:
 
 def uncalibrated(problem: Problem, point: Point) -> Point:
     """The point with all biases zero, but for the clocks by which the rows of the problem are taken."""
-    return point._replace(z=jnp.asarray(problem.first_z))
+    return point._replace(z=jax.device_put(problem.first_z))

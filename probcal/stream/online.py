@@ -477,7 +477,7 @@ class Online:
             walk[chosen] = std / problem.scales[chosen]
         for pattern in self.method.consider:
             considered[_chosen(problem.labels, pattern, "consider")] = True
-        self.given = FilterGiven(jnp.asarray(levels), jnp.asarray(walk), jnp.asarray(considered))
+        self.given = FilterGiven(jax.device_put(levels), jax.device_put(walk), jax.device_put(considered))
         self.check.reads = {name: frozenset(self.read_by(name).tolist()) for name in self.check.reads}
         self.form = FilterForm(
             self.method.by, bool(walk.any()), bool(considered.any()), not self.method.lag, float(self.method.gate)
@@ -497,10 +497,10 @@ class Online:
         """Mean and root of the biases before the stream."""
         if self.calibration is not None:
             known = apply(problem, self.calibration)
-            return jnp.asarray(known.z), jnp.asarray(cholesky(_positive(known.covariance)))
+            return jax.device_put(known.z), jax.device_put(cholesky(_positive(known.covariance)))
         matrix = np.asarray(self.prior.precision(problem.labels, problem.surveyed).matrix())
         root = cholesky(_positive(invert(matrix)))
-        return jnp.zeros(problem.model.biases), jnp.asarray(root)
+        return jnp.zeros(problem.model.biases), jax.device_put(root)
 
     # epochs through the filter
 
@@ -570,7 +570,7 @@ class Online:
                     " or take a lag"
                 )
             if jump is not None:
-                self.belief = beliefs.jumped(self.belief, jnp.asarray(jump[1]), jump[3], jump[4])
+                self.belief = beliefs.jumped(self.belief, jax.device_put(jump[1]), jump[3], jump[4])
                 jumps.append(jump[2])
                 self.since = [float(batch.time[begun + int(done[leaving]) - 1])] * self._starts
             taken = int(done[leaving])
@@ -674,7 +674,9 @@ class Online:
         """
         self.check.snapshots = []
         columns, shift = self._step_of(change)
-        belief, slots = beliefs.dispersed(self.belief, self.belief.slots, jnp.asarray(columns), jnp.asarray(-shift))
+        belief, slots = beliefs.dispersed(
+            self.belief, self.belief.slots, jax.device_put(columns), jax.device_put(-shift)
+        )
         self.belief = belief._replace(slots=slots)
         if self.method.jumps is None or change.bias < 0:
             return ()
@@ -858,7 +860,7 @@ class Online:
         oldest = int(np.argmin(self.since))
         M = self._problem.model.biases
         columns = np.repeat(np.arange(self._starts) == oldest, M)
-        self.belief = beliefs.renewed(self.belief, jnp.asarray(columns))
+        self.belief = beliefs.renewed(self.belief, jax.device_put(columns))
         self.since = [*self.since[:oldest], self.walked, *self.since[oldest + 1 :]]
 
     def _jump(self, stack: Augmented, done: np.ndarray, times: np.ndarray) -> Any:
@@ -891,7 +893,7 @@ class Online:
             problem.labels[m], float(started), end, float(size * scale), float(scale * np.sqrt(variance)),
             float(odds[part, which]), float(min(share, 1.0) * (end - started)),
         )  # fmt: skip
-        return part, which, own, jnp.asarray(size), jnp.asarray(variance)
+        return part, which, own, jax.device_put(size), jax.device_put(variance)
 
     # what is known
 
