@@ -241,6 +241,7 @@ class Family:
 
 def _derivative(function: Callable[[Any], Any], at: Any) -> Any:
     """Derivative of a function of each entry by that entry."""
+    at = jnp.asarray(at, float)
     return jax.jvp(function, (at,), (jnp.ones_like(at),))[1]
 
 
@@ -1002,6 +1003,10 @@ class Bernoulli(Family):
     def information(self, predicted, std):
         """Expected information about the log odds."""
         return jax.nn.sigmoid(predicted) * jax.nn.sigmoid(-predicted)
+
+    def level_score(self, y, predicted, std, period):
+        """One: a std has no meaning here."""
+        return jnp.ones_like(predicted)
 
     def sample(self, key, predicted, std):
         """Draw ones and zeros."""

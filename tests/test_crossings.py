@@ -177,7 +177,7 @@ def test_chains_cross_with_a_node_alone(seed, method):
     assert sampled["crossed"].mean() > 0.2
     lighter = min((sampled["side"].values == k).mean() for k in (0, 1))
     assert abs(lighter - np.exp(gain) / (1 + np.exp(gain))) < 0.06
-    assert "The posterior has 2 sides" in tree.attrs["message"]
+    assert "The posterior has 2 modes" in tree.attrs["message"]
     assert tree["calibration"]["r_hat"].max() < 1.05
     assert bias(tree, "b0.position_y")[1] > 4.0
 

@@ -113,8 +113,8 @@ def test_a_mirror_is_reported_with_its_biases_and_they_are_weak(name, form):
     np.testing.assert_allclose(there, -own, atol=1.5 * sd.max())
     level = {"line": 0.0, "ceiling": 3.0}[name]
     track = only(tree)["mean"].values[:, problem.network.dimension - 1]
-    other = tree["mirror/track/target"]["position"]
-    np.testing.assert_allclose(other.isel(mode=0).sel(axis=axis) - level, level - track, atol=1.0)
+    other = tree["mode/track/target"]["position"]
+    np.testing.assert_allclose(other.isel(mode=1).sel(axis=axis) - level, level - track, atol=1.0)
     legend = [text.get_text() for text in plot_map(tree).get_legend().get_texts()]
     assert "fits as well" in legend
     verdicts = probcal.assess(problem, tree)["verdict"].to_dataset()
@@ -349,7 +349,7 @@ def test_chains_visit_both_sides_by_their_weights(method):
     share = np.exp(gain) / (1 + np.exp(gain))
     lighter = min((stats["side"].values == k).mean() for k in (0, 1))
     assert abs(lighter - share) < 5 * np.sqrt(share * (1 - share) / (0.2 * stats["side"].size))
-    assert "The posterior has 2 sides" in tree.attrs["message"]
+    assert "The posterior has 2 modes" in tree.attrs["message"]
     assert tree["calibration"]["r_hat"].max() < 1.05
     assert tree["calibration"]["sd"].sel(bias_label="b1.position_y") > 2.0
     verdicts = probcal.assess(problem, tree)["verdict"].to_dataset()
@@ -457,3 +457,17 @@ def test_an_answer_stands_where_no_fit_comes_from_a_better_place(monkeypatch):
 def test_a_further_answer_that_no_fit_confirms_is_kept_as_it_was_found(monkeypatch):
     found = beside_others(monkeypatch, (None, [("across", 4.0, -0.5)]), {4.0: None})
     assert listed(found) == [("across", -0.5, 4.0)]
+
+
+@pytest.mark.ci
+def test_chains_on_two_sides_are_judged_where_the_reported_answer_lies():
+    """Not between the sides, where no datum fits."""
+    problem, _ = networks.setting(0, "line", share=1.0)
+    tree = probcal.fit(problem, probcal.NUTS(chains=2, warmup=50, draws=60), prior=probcal.Gaussian())
+    here, there = tree["mode/track/target"]["position"].values[:2, :, 1]
+    assert np.ptp(tree["sample_stats"]["side"].values) == 1
+    assert np.abs(here).max() > 15.0
+    np.testing.assert_allclose(here, -there, atol=1.0)
+    assessed = probcal.assess(problem, tree)
+    assert set(assessed["verdict"]["verdict"].values) <= {"weak", "determined"}
+    assert not any("innovations" in sentence for sentence in assessed["finding"]["sentence"].values)

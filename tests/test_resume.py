@@ -1,13 +1,14 @@
 """Every method is killed, interrupted and ended by a limit on one tiny problem, and resumed to the identical result."""
 
 from contextlib import suppress
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from worlds import linear, resting
 
 import probcal as pc
-from probcal.inference import storage, table
+from probcal.inference import loop, storage, table
 
 
 class Killed(Exception):
@@ -118,3 +119,34 @@ def test_turns_of_several_starts_are_resumed_too(engine, tmp_path, monkeypatch):
     found, whole = stop_and_resume(fitted)
     assert found.identical(whole)
     assert len(list((tmp_path / "whole").glob("loop-*.npz"))) > 1
+
+
+class Counted(loop.Task):
+    """Counts its steps; a limit is reached while it begins."""
+
+    name, iterations, biases = "counted", 9, 1
+
+    def __init__(self, monitor):
+        self.monitor = monitor
+
+    def init(self):
+        self.monitor.stopped = "the limit of time was reached"
+        return np.zeros(1)
+
+    def step(self, state, count, pause):
+        return state + 1, loop.Trace(state, state[None], state[None])
+
+    def ended(self, state, course):
+        return False
+
+
+def test_a_limit_that_ends_in_the_beginning_of_a_loop_leaves_a_step_and_lets_a_resumed_one_go_on():
+    kept, found = SimpleNamespace(found=None, due=True), []
+    kept.write = lambda arrays, course: found.append((arrays, list(course)))
+    for steps in (1, 2, 3):
+        monitor = SimpleNamespace(stopped="", tell=lambda *_, **__: None)
+        state, course = loop.run(Counted(monitor), monitor, SimpleNamespace(checkpoint=lambda *_: kept))
+        assert (state, course.iterations) == (steps, steps)
+        kept.found = found[-1]
+    with pytest.raises(pc.InputError, match="another form"):
+        loop.like(np.zeros(2), found[-1][0])

@@ -565,7 +565,8 @@ def sparse(place, covariance=1.0):
     return change
 
 
-def test_a_file_of_version_3_has_its_other_answers_in_one_group(tmp_path):
+@pytest.mark.parametrize("kind", [{"kind": ("mirror", ["scene"])}, {}], ids=["", "the first files"])
+def test_a_file_of_version_3_has_its_other_answers_in_one_group(kind, tmp_path):
     """A mirror, found again from start 1; starts 0 and 2 came to the reported answer, start 3 ended far below."""
     tree = committed.tree("map")
     group = tree["calibration"].to_dataset()
@@ -578,7 +579,7 @@ def test_a_file_of_version_3_has_its_other_answers_in_one_group(tmp_path):
         xr.Dataset({"bias": (dims, biases), "status": ("optimum", ["converged"] * 4), **scores}, labels)
     )
     apart = ("mirror", "bias_label")
-    mirror = {"gain": ("mirror", [-1.0]), "kind": ("mirror", ["scene"]), "bias": (apart, there[None])}
+    mirror = {"gain": ("mirror", [-1.0]), "bias": (apart, there[None])} | kind
     tree["mirror"] = xr.DataTree(xr.Dataset(mirror, {"mirror": ["turned"], **labels}, {"same": 3.0}))
     car = tree["track/car"].to_dataset()
     places = car["mean"].sel(component=["position_x", "position_y"]).values[None]

@@ -15,6 +15,7 @@ import xarray as xr
 
 from probcal.analysis import predictive
 from probcal.analysis.findings import Finding
+from probcal.errors import InputError
 from probcal.gaussian.draws import many_data
 from probcal.inference import residuals
 from probcal.inference.fitted import Judged
@@ -23,6 +24,9 @@ from probcal.linalg import invert
 from probcal.results.blocks import SensorBlocks
 from probcal.simulate import Truth
 from probcal.status import INVALID, Status
+
+# no misfit; no invalid end; a factor of the biases; draws of tracks; the truth
+NEEDS = ("explained", "answer", "factor", "draws", "truth")
 
 
 class Checked(NamedTuple):
@@ -47,15 +51,11 @@ class Case:
 
     @cached_property
     def has(self) -> frozenset[str]:
-        """What a check may need of a fit.
-
-        "explained": no misfit; "answer": no invalid end; "factor" of the biases; "draws" of tracks; a "truth".
-        """
+        """What a fit has of `NEEDS`."""
         status, engine = Status(self.tree.attrs["status"]), self.fit.engine
         drawable = engine.cheap or (engine.exact and not many_data(self.fit.problem.model))
-        facts = {"explained": status.explains, "answer": status not in INVALID, "factor": engine.exact}
-        facts |= {"draws": drawable, "truth": self.truth is not None}
-        return frozenset(name for name, holds in facts.items() if holds)
+        facts = status.explains, status not in INVALID, engine.exact, drawable, self.truth is not None
+        return frozenset(name for name, holds in zip(NEEDS, facts, strict=True) if holds)
 
     @cached_property
     def drawn(self) -> predictive.FitDraws:
@@ -113,5 +113,10 @@ class Check:
 
 
 def check(*needs: str, causes: Sequence[str] = ()) -> Any:
-    """Make a check of a function of a `Case`; see `Check`."""
+    """Make a check of a function of a `Case`.
+
+    Raises `InputError` for a need that no fit can have.
+    """
+    if unknown := set(needs) - set(NEEDS):
+        raise InputError(f'check: no fit has "{min(unknown)}"; a check may need {", ".join(NEEDS)}')
     return lambda function: Check(function, frozenset(needs), causes)

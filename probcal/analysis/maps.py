@@ -152,12 +152,16 @@ class BiasBlocks(NamedTuple):
                 np.minimum.at(least, own, least[own].min(1, initial=M)[:, None])
                 least[M] = M
         numbers, block = np.unique(least[:M], return_inverse=True)
-        order, sizes = np.argsort(block, kind="stable"), np.bincount(block, minlength=len(numbers))
+        sizes = np.bincount(block, minlength=len(numbers))
+        if len(sizes) * int(sizes.max(initial=0)) ** 2 > M**2:
+            # padded they would take more memory than one matrix of all
+            block, sizes = np.zeros(M, int), np.array([M])
+        order = np.argsort(block, kind="stable")
         place = np.zeros(M, int)
         place[order] = np.arange(M) - np.repeat(np.cumsum(sizes) - sizes, sizes)
         p = int(sizes.max(initial=0))
         block, place = np.append(block, 0), np.append(place, p)
-        covariance, at = np.zeros((len(numbers), p + 1, p + 1)), place[spread.members]
+        covariance, at = np.zeros((len(sizes), p + 1, p + 1)), place[spread.members]
         number = block[spread.members].max(1, initial=0)[:, None, None]
         covariance[number, at[:, :, None], at[:, None, :]] = spread.covariance
         return cls(

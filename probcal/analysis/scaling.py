@@ -25,7 +25,7 @@ THRESHOLD = 0.05  # of the distance a power, ArviZ's own
 def check_scaling(case: Case) -> Checked:
     """Sensitivity (bias_label) of each bias to prior and likelihood, where the tree holds both.
 
-    None where the draws' densities have no tail to weigh by: those of an answer far from Gaussian, whose worst
+    Empty where the draws' densities have no tail to weigh by: those of an answer far from Gaussian, whose worst
     draws lie so deep that all others are alike.
     `noise` is the largest sensitivity found after the draws of the densities were shuffled against those of the
     biases: with the log-likelihood of thousands of data it may exceed ArviZ's threshold of 0.05, and what stays

@@ -98,10 +98,11 @@ def _imported() -> Any:
     """
     said = os.environ.get(THREADS)
     os.environ.setdefault(THREADS, "1")  # read when the library is loaded
-    import sparsax  # an extra
-
-    if said is None:
-        del os.environ[THREADS]
+    try:
+        import sparsax  # an extra
+    finally:
+        if said is None:
+            os.environ.pop(THREADS, None)
     return sparsax
 
 

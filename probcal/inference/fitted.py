@@ -148,8 +148,17 @@ def take_up(problem: Problem, fit: xr.DataTree) -> Judged:
     engine, point = engine_of(asked, problem.model), point_of(problem, fit, group)
     if fit.attrs.get("places") == "integrated":
         problem = problem.with_tilt(tilt_at(problem.model, point))
-    at = engine.at(problem.model, point)
-    return Judged(problem, at, picks, data, _prior(group), spread, engine, group["gamma"].values)
+    at, prior = engine.at(problem.model, point), _prior(group)
+    if on_several_sides(fit):  # judged is the reported answer, not what lies between
+        every = np.arange(at.model.biases)
+        spread = SensorBlocks.of(np.asarray(at.marginals(Factors.of(prior), every[None]))[0])
+    return Judged(problem, at, picks, data, prior, spread, engine, group["gamma"].values)
+
+
+def on_several_sides(fit: xr.DataTree) -> bool:
+    """Whether the draws of a tree lie on several sides of a mirror."""
+    stats = fit["sample_stats"].to_dataset() if "sample_stats" in fit.children else {}
+    return "side" in stats and bool(np.ptp(stats["side"].values))
 
 
 def _weighted(problem: Problem, tracked: dict[str, xr.Dataset]) -> Problem:
@@ -165,7 +174,14 @@ def _weighted(problem: Problem, tracked: dict[str, xr.Dataset]) -> Problem:
 def point_of(problem: Problem, fit: xr.DataTree, group: xr.Dataset) -> Point:
     """Biases and levels of the tree, trajectories at their mode, searched from the saved ones."""
     tracked = dict(each_track(fit))
-    saved = [saved_by_epoch(epochs, tracked, "mean", "targets") for epochs in problem.epochs]
+    places = fit["mode/track"].children.items() if on_several_sides(fit) else ()
+    reported = {name: node.to_dataset().isel(mode=0) for name, node in places}
+    saved = []
+    for epochs in problem.epochs:
+        saved.append(saved_by_epoch(epochs, tracked, "mean", "targets"))
+        if reported:
+            own = saved_by_epoch(epochs, reported, "position", "targets")
+            saved[-1][:, slice(*epochs.position)] = own
     point = follow_states(problem, saved)
     if problem.levels:
         level = fit["level"].to_dataset()

@@ -85,18 +85,19 @@ class Task(ABC):
 def run(task: Task, monitor: Monitor, storage: Storage | None = None) -> tuple[Any, Any]:
     """Run a task until it has ended, is spent or stopped: its last state and its course.
 
-    A storage keeps state and course on the way; what it holds of this loop is gone on with. Of a loop that begins when
-    the call is stopped nothing is written, since it is not what an uninterrupted run does.
+    A storage keeps state and course on the way; what it holds of this loop is gone on with, by one step at least. Of a
+    loop that begins when the call is stopped nothing is written, since it is not what an uninterrupted run does.
     """
+    late = bool(monitor.stopped)
     state, course, moved = task.init(), task.course(), False
-    kept, late = None if storage is None else storage.checkpoint(task.kind, arrays_of(state)), bool(monitor.stopped)
+    kept = None if storage is None else storage.checkpoint(task.kind, arrays_of(state))
 
     def pause(done: int, objective: float) -> bool:
         task.tell(monitor, done, objective)
         return bool(monitor.stopped) or (kept is not None and not late and kept.due)
 
     if kept is not None and kept.found is not None:
-        state, course, moved = like(state, kept.found[0]), task.course(kept.found[1]), True
+        state, course = like(state, kept.found[0]), task.course(kept.found[1])
     while True:
         if done := course.iterations:
             task.tell(monitor, done, float(course.objective[-1]))
@@ -124,7 +125,7 @@ def is_key(leaf: Any) -> bool:
 def like(state: Any, leaves: Sequence[np.ndarray]) -> Any:
     """The stored leaves in the form of a state, on the device where its own are; raises `InputError` for others."""
     own, form = jax.tree.flatten(state)
-    if len(own) != len(leaves):
+    if [np.shape(leaf) for leaf in arrays_of(state)] != [np.shape(leaf) for leaf in leaves]:
         raise InputError(
             "the state of the stored run has another form than this run's: begin anew with --overwrite (overwrite=True)"
         )

@@ -146,7 +146,7 @@ class Chains(MethodTask):
         self._enter(plan.phase(count))
         state, draws = self.advance(state, plan.thin)
         kept, arrays = plan.kept(count), flat_arrays(draws)
-        last = {name: a[:, a.shape[1] - kept :] for name, a in arrays.items()}
+        last = {name: a[:, a.shape[1] - kept :].copy() for name, a in arrays.items()}
         return state, DrawnChunks([last | {MEAN: np.mean(arrays["density"])}])
 
     def ended(self, state: Any, course: DrawnChunks) -> bool:
@@ -221,7 +221,7 @@ def flat_arrays(draws: Draw) -> dict[str, np.ndarray]:
 
 
 def gathered(arrays: Mapping[str, np.ndarray]) -> Draw:
-    """The draws of arrays by flat names: what `named` made."""
+    """The draws of arrays by flat names: what `flat_arrays` made."""
 
     def group(prefix: str) -> dict[str, Any]:
         return {name.removeprefix(prefix): a for name, a in arrays.items() if name.startswith(prefix)}

@@ -206,7 +206,7 @@ def _beside_mirrors(answer: Answer, method: Maximiser, context: Context) -> Answ
             own = _like_first(answer, problem, method, other.point, context)
         late = fits and own is None and bool(monitor.stopped)
         skipped += late
-        if own is None and other.gain > MORE and not late:
+        if own is None and other.gain > MORE:
             unseen = f"Under the declared scales another place fits better ({other.name}), from which no fit came."
         elif own is None:
             found.append((other._replace(shift=np.asarray(other.point.z)), None))

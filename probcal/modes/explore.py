@@ -121,13 +121,14 @@ def explore(problem: Problem, point: Point, climb: SideClimb, proposals: Sequenc
     given = here = _Here(problem, climb, point)
     way: tuple[str, str] | None = None
     others: list[Mirrored] = []
-    for k in range(ROUNDS):
+    for _ in range(ROUNDS):
         here, moved, near = _moved(here, proposals)
         way, others = moved or way, _ranked(here, near)
-        if k + 1 == ROUNDS or not others or others[0].gain <= MORE:
+        if not others or others[0].gain <= MORE:
             break
         first = others[0]
         way, here = (first.name, first.kind), _Here(problem, climb, first.point)
+        others = [o._replace(gain=o.gain - first.gain, shift=o.shift - first.shift) for o in others[1:]]
     others.sort(key=lambda one: (one.gain <= -SAME, one.kind != SCENE, -one.gain))
     if way is None:
         return Sides(point, False, tuple(others[:MOST]))

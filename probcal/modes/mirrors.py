@@ -57,12 +57,16 @@ def _counts(problem: Problem) -> list[np.ndarray]:
 
 
 def reflected_scenes(problem: Problem, point: Point, most: float = np.inf) -> Iterator[Candidate]:
-    """Reflections of the whole scene, and of the track of one target alone, that fit nearly as well unpolished."""
+    """Reflections of the whole scene, and of the track of one target alone, that fit nearly as well unpolished.
+
+    Those first that fit best.
+    """
     z, free, counts = np.asarray(point.z), movable(problem), _counts(problem)
     targets = [n for epochs in problem.epochs for n in epochs.members if n in problem.targets]
     every = sum(float(count.sum()) for count in counts)
     found = planes(problem, z)
     here = _losses(problem, z, point, None) if found else []
+    seen: list[tuple[float, Candidate]] = []
     for plane in found:
         other = reflect_nodes(problem, z, plane)
         ways = [(z, "")] if np.array_equal(other, z) else [(other, " and nodes"), (z, "")]
@@ -73,7 +77,8 @@ def reflected_scenes(problem: Problem, point: Point, most: float = np.inf) -> It
             if any(mine.any() for mine in free) and total < WORSE * every:
                 who = "the targets" if len(targets) > 1 else f'target "{targets[0]}"'
                 whole = reflect(problem, point, plane, free, biases)
-                yield Candidate(f"{who}{word} reflected in {plane.name}", SCENE, whole)
+                way = f"{who}{word} reflected in {plane.name}"
+                seen.append((total / every, Candidate(way, SCENE, whole)))
             if len(targets) < 2 or word:
                 continue
             for name in targets[:MOST]:
@@ -82,7 +87,9 @@ def reflected_scenes(problem: Problem, point: Point, most: float = np.inf) -> It
                 loss = sum(float(w[mine].sum()) for w, mine in zip(worse, own, strict=True))
                 if any(mine.any() for mine in own) and loss < WORSE * much:
                     alone = reflect(problem, point, plane, own, z)
-                    yield Candidate(f'target "{name}" reflected in {plane.name}', SCENE, alone)
+                    way = f'target "{name}" reflected in {plane.name}'
+                    seen.append((loss / much, Candidate(way, SCENE, alone)))
+    yield from (candidate for _, candidate in sorted(seen, key=lambda one: one[0]))
 
 
 class _Piece(NamedTuple):

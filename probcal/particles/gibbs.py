@@ -131,7 +131,7 @@ def begin_chains(form: Form, how: Particles, held: Held, theta: Any, keys: jax.A
 
 @dataclass(eq=False)
 class ParticleChains(Chains):
-    """Chains of particle Gibbs: a thread each on a CPU, one after the other on an accelerator."""
+    """Chains of particle Gibbs: a thread each."""
 
     def init(self) -> GibbsState:
         """Chains about the start, further out than the data leave the biases, on paths drawn there."""

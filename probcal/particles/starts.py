@@ -26,7 +26,7 @@ def solve_by_particles(
     Where none is given it is the joint mode, mirrors seen to, with motions of a linear form in the place of others
     (`Motion.loose`), and zero where there is none. Further starts are draws of the biases within their scales; the one
     of the greatest evidence is the answer. A climb that particles threw off is tried again with others. Mirrored
-    answers are those of the joint mode.
+    answers are those of the joint mode, of an answer that began there.
     """
     linear = all(form is None for form in problem.model.sampled)
     near = problem if linear else problem.loosened()
@@ -52,4 +52,6 @@ def solve_by_particles(
         answers.append(max(tries, key=rank))
     best = max(range(len(answers)), key=lambda k: rank(answers[k]))
     found = noting_unseen(answers[best], starts_unseen(len(answers), starts), context.monitor)
-    return replace(found, optima=tuple(answers) if len(answers) > 1 else (), best=best, mirrors=mirrors)
+    mean = found.posterior.here[0]
+    seen = [o._replace(shift=np.asarray(o.point.z) - mean, status="") for o in mirrors if best == 0]
+    return replace(found, optima=tuple(answers) if len(answers) > 1 else (), best=best, mirrors=tuple(seen))

@@ -12,10 +12,10 @@ import numpy as np
 
 from probcal.gaussian.draws import many_data, residuals
 from probcal.gaussian.mode import Point
-from probcal.labels import AXES
+from probcal.labels import AXES, START
 from probcal.lazy import xr
 from probcal.model.motions import level_values
-from probcal.modes.explore import SAME
+from probcal.modes.explore import NEAR, SAME
 from probcal.results.accessor import register
 from probcal.results.answer import Answer, Draws, Summary, Tracks
 from probcal.results.groups import (
@@ -29,7 +29,7 @@ from probcal.results.groups import (
     gather,
     track_groups,
 )
-from probcal.results.modes import ELSEWHERE, LEAST, REPORTED, ModeRow, mode_group, unlike
+from probcal.results.modes import AGAIN, ELSEWHERE, LEAST, REJECTED, REPORTED, ModeRow, mode_group, same_as
 from probcal.results.schema import BOUND, EVIDENCE, INTERVAL, RESULTS_VERSION
 from probcal.table import first_date
 
@@ -241,7 +241,7 @@ def _origin(problem: Problem) -> dict[str, str]:
 def modes_of(answer: Answer) -> tuple[list[ModeRow], list[Sequence[Any]]]:
     """All answers of a fit and their states (E, n), the reported one first, then others by gain.
 
-    No other function reads what an `Answer` carries besides its own posterior.
+    The tree has what an `Answer` carries besides its own posterior by this function alone.
     """
     scales, posterior, optima = answer.problem.scales, answer.posterior, dict(enumerate(answer.optima))
     mean, sd = (own * scales for own in posterior.here)
@@ -253,7 +253,8 @@ def modes_of(answer: Answer) -> tuple[list[ModeRow], list[Sequence[Any]]]:
         return {} if k is None else _of_start(k, optima.pop(k))
 
     known = {"status": str(answer.status)} | started(posterior.point)
-    modes, states = [ModeRow(REPORTED, REPORTED, mean, 0.0, **known)], [posterior.states]
+    modes = [ModeRow(REPORTED, REPORTED, mean, 0.0, **known)]
+    states = [posterior.states if posterior.side is None else posterior.point.states]
     for other in sorted(answer.mirrors, key=lambda other: -other.gain):
         known = {"status": other.status} | started(other.point)
         modes.append(ModeRow(other.name, other.kind, mean + other.shift * scales, other.gain, **known))
@@ -261,7 +262,9 @@ def modes_of(answer: Answer) -> tuple[list[ModeRow], list[Sequence[Any]]]:
     for k, one in sorted(optima.items(), key=lambda item: -item[1].objective):
         bias = one.posterior.here[0] * scales
         gain = one.objective - answer.objective if one.method == answer.method else np.nan
-        modes.append(ModeRow(ELSEWHERE, unlike(bias, modes, sd), bias, gain, **_of_start(k, one)))
+        kind = START if one.status.settled and gain > -NEAR else REJECTED
+        kind = kind if same_as(bias, modes, sd) is None else AGAIN
+        modes.append(ModeRow(ELSEWHERE, kind, bias, gain, **_of_start(k, one)))
         states.append(one.posterior.states)
     return modes, states
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from probcal.labels import coordinates
+from probcal.labels import SCENE, coordinates
 from probcal.lazy import xr
 from probcal.results.schema import DIFFERENT, RESULTS_VERSION, evidence_in
 
@@ -35,10 +35,10 @@ def apart(bias: np.ndarray, other: np.ndarray, sd: np.ndarray) -> np.ndarray:
     return np.abs(bias - other) / np.maximum(sd, 1e-12)
 
 
-def unlike(bias: np.ndarray, others: Sequence[ModeRow], sd: np.ndarray) -> str:
-    """The kind of an answer that no reader shall count: one that came back, or a worse one."""
+def same_as(bias: np.ndarray, others: Sequence[ModeRow], sd: np.ndarray) -> int | None:
+    """The row of the answer that biases came back to."""
     near = (np.max(apart(bias, other.bias, sd), initial=0.0) <= DIFFERENT for other in others)
-    return AGAIN if any(near) else REJECTED
+    return next((k for k, there in enumerate(near) if there), None)
 
 
 def mode_group(
@@ -103,7 +103,8 @@ def upgraded(tree: xr.DataTree) -> xr.DataTree:
     if "mirror" in tree.children:
         old = tree["mirror"].to_dataset()
         attrs["same"] = old.attrs["same"]
-        rows = zip(*(old[name].values for name in ("mirror", "kind", "bias", "gain")), strict=True)
+        kinds = old["kind"].values if "kind" in old else [SCENE] * old.sizes["mirror"]
+        rows = zip(old["mirror"].values, kinds, old["bias"].values, old["gain"].values, strict=True)
         modes += [ModeRow(str(name), str(kind), bias, float(gain)) for name, kind, bias, gain in rows]
         for target, node in tree["mirror/track"].children.items():
             tracks[f"track/{target}"] = _with_reported(node, tree.children["track"].children[target])
@@ -112,10 +113,12 @@ def upgraded(tree: xr.DataTree) -> xr.DataTree:
         old = tree["optimum"].to_dataset()
         name = attrs["objective"] = evidence_in(old) or "objective"
         least = np.maximum(sd, LEAST * group["scale"].values)
-        columns = (old[key].values for key in ("bias", "status", "start", name))
+        columns = [old[key].values for key in ("bias", "status", "start", name)]
+        first = same_as(columns[0][0], modes, least)
+        base = np.nan if first is None else modes[first].gain - columns[-1][0]
         for bias, status, start, score in zip(*columns, strict=True):
-            kind, gain = unlike(bias, modes, least), float(score - old[name].values[0])
-            modes.append(ModeRow(ELSEWHERE, kind, bias, gain, str(status), int(start), float(score)))
+            kind = REJECTED if same_as(bias, modes, least) is None else AGAIN
+            modes.append(ModeRow(ELSEWHERE, kind, bias, float(score + base), str(status), int(start), float(score)))
         del tree["optimum"]
     tracks = {name: own.pad({"mode": (0, len(modes) - own.sizes["mode"])}) for name, own in tracks.items()}
     coords = {"bias_label": group["bias_label"].values}
