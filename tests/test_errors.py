@@ -47,6 +47,7 @@ from probcal import (
     track,
     write_nodes,
 )
+from probcal.analysis.check import check
 from probcal.cli import commands
 from probcal.cli.models import load_model, load_truth
 from probcal.geometry import norm
@@ -192,6 +193,7 @@ def points(*features):
 CASES = [
     (lambda _: Problem([1], CV, None), "Problem: network is of type list; give a Network, as in Network([sensor_type.on("),
     (lambda _: choose_prior(MAP(), "gaussian"), "the prior is 'gaussian'; give a prior itself, such as Horseshoe() or"),
+    (lambda _: check("answers"), 'check: no fit has "answers"; a check may need explained, answer, factor, draws, truth'),
     (lambda _: as_motion(ConstantVelocity), "ConstantVelocity'> is not a motion; give ConstantVelocity(std)"),
     (lambda _: sensor(a=Channel("m"))(lambda target, pose, o=Bias("m", 1.0): {"a": o}), 'argument "o" is a bias: write a * before the first bias'),
     # sensor
