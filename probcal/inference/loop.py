@@ -123,9 +123,15 @@ def is_key(leaf: Any) -> bool:
 
 
 def like(state: Any, leaves: Sequence[np.ndarray]) -> Any:
-    """The stored leaves in the form of a state, on the device where its own are; raises `InputError` for others."""
+    """The stored leaves in the form of a state, on the device where its own are; raises `InputError` for others.
+
+    What the state leaves empty at the beginning may have any shape.
+    """
     own, form = jax.tree.flatten(state)
-    if [np.shape(leaf) for leaf in arrays_of(state)] != [np.shape(leaf) for leaf in leaves]:
+    first = arrays_of(state)
+    if len(first) != len(leaves) or any(
+        mine.size and mine.shape != leaf.shape for mine, leaf in zip(first, leaves, strict=True)
+    ):
         raise InputError(
             "the state of the stored run has another form than this run's: begin anew with --overwrite (overwrite=True)"
         )
