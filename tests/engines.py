@@ -74,23 +74,26 @@ VERBS = {  # what each answers in numbers to the world, by the fit of an engine 
     "log_evidence": lambda at, engine: pc.log_evidence(at.problem, prior=pc.Gaussian()).value,
     "simulate": lambda at, engine: pc.simulate(at.problem.network, at.problem.motion, range(3)).table["azimuth"],
 }
-METHODS = {
-    "EA": lambda engine: pc.EA(engine=named(engine)),
-    "MAP": lambda engine: pc.MAP(engine=named(engine)),
-    "LeastSquares": lambda engine: pc.LeastSquares(engine=named(engine)),
-    "Gibbs": lambda engine: pc.Gibbs(chains=2, warmup=10, draws=10),
-} | {  # detections without names, which `SelfConfiguration` asks for, are another world
-    name: lambda engine, name=name: getattr(pc, name)()
-    for name in of_priors().index
-    if name not in ("EA", "MAP", "LeastSquares", "Gibbs", "SelfConfiguration")
-}
+ENGINED = ("EA", "EMEA", "EM", "MAP", "LeastSquares")
+METHODS = (
+    {name: lambda engine, name=name: getattr(pc, name)(engine=named(engine)) for name in ENGINED}
+    | {
+        "Gibbs": lambda engine: pc.Gibbs(chains=2, warmup=10, draws=10),
+    }
+    | {  # detections without names, which `SelfConfiguration` asks for, are another world
+        name: lambda engine, name=name: getattr(pc, name)()
+        for name in of_priors().index
+        if name not in (*ENGINED, "Gibbs", "SelfConfiguration")
+    }
+)
 NOT = {  # what is not done, by the heading of a column: part of the sentence that says so
     "observability": {"iterative": "without a factor of the biases variances"},
     "changes": {"above 600 biases": "changes needs the information of all biases"},
     "EA": {"iterative": GIVEN},
+    "EMEA": {"iterative": GIVEN},
 } | {
     name: dict.fromkeys(list(KINDS.values())[1:], DENSE)
-    for name in METHODS if name not in ("EA", "MAP", "LeastSquares", "Gibbs")
+    for name in METHODS if name not in (*ENGINED, "Gibbs")
 }  # fmt: skip
 
 BY_SIZE = {"bounds", "next_passes", "next_anchors", "next_sensors", "sensitivity", "Gibbs"}  # nobody asks them for one

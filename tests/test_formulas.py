@@ -154,7 +154,7 @@ def test_an_unknown_level_moves_as_far_as_its_prior_lets_it(factor, least, most)
     with jax.enable_x64(True):
         point = find_mode(problem.model, resting(problem), Precision(jnp.ones(1)), 30, 1e-9).point
         stds = [np.asarray(problem.model.noise_std(jnp.full(1, level))[0]) for level in (0.0, 0.5)]
-        variances = Variances.dense(problem.model, point, jnp.eye(1))
+        variances = Variances.dense(DenseEngine().at(problem.model, point), jnp.eye(1))
         moved = float(update_levels(problem.model, point, *variances).levels[0])
     np.testing.assert_allclose(stds[1], np.exp(0.5) * stds[0])
     assert least < moved < most

@@ -745,7 +745,7 @@ def test_tracks_under_heavy_tails_are_those_of_the_dense_engine(library, monkeyp
 
 
 FORCED = ("cholmod", *(pytest.param(name, marks=pytest.mark.ci) for name in ("superlu", "many", "iterative")))
-SHORT = {"fit", "next_anchors", "changes", "compare", *engines.NOT} - {"observability", "EA"}
+SHORT = {"fit", "next_anchors", "changes", "compare", *engines.NOT} - {"observability", "EA", "EMEA"}
 TIERS = dict.fromkeys(("EA", "Gibbs"), pytest.mark.slow) | dict.fromkeys(SHORT, ())
 CELLS = [pytest.param(name, marks=TIERS.get(name, pytest.mark.ci)) for name in (*engines.VERBS, *engines.METHODS)]
 
@@ -772,6 +772,16 @@ def test_every_verb_and_method_runs_on_every_engine_or_says_why_not(name, forced
         close = 0.1 if forced == "iterative" else 1e-3  # of what draws estimate, or climbs end at
         for own, wanted in zip(jax.tree.leaves(found), jax.tree.leaves(answer("dense")), strict=True):
             np.testing.assert_allclose(own, wanted, rtol=close, atol=close * np.abs(wanted).max())
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("method", [pc.EM(pc.Unscented(), iterations=20), pc.EMEA(iterations=20)], ids=lambda m: m.name)
+def test_em_on_any_engine_is_that_of_the_dense_one(method):
+    problem, start = engines.world().problem, engines.world().start
+    engined = (replace(method, engine=name) for name in ("dense", "superlu"))
+    one, other = (pc.fit(problem, own, start=start)["calibration"] for own in engined)
+    for name in ("mean", "sd", "gamma", "precision"):
+        np.testing.assert_allclose(other[name], one[name], rtol=1e-9)
 
 
 @pytest.mark.needs("particles")

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from probcal.gaussian.information import state_covariances
 from probcal.gaussian.mode import Point, cost, eliminate_rows, find_mode, follow, shortened
 from probcal.model import sigma
-from probcal.model.model import Model
+from probcal.model.model import Data, Model
 from probcal.priors import Precision
 
 
@@ -23,7 +23,7 @@ class Expected(NamedTuple):
     """What an E-step leaves for the M-step."""
 
     point: Point  # the same biases, trajectories at the mode or mean of their density given these
-    information: jax.Array  # (M, M) of the biases at fixed trajectories, expected over them
+    information: Data  # (S, p, p) of the biases of each sensor of each block, trajectories fixed, expected over them
     score: jax.Array  # (M,) likewise
     slack: float  # of the cost, by which a step of the biases may lie above: a mean is no mode
     refused: jax.Array  # () whether the step left its start for nothing better
@@ -52,7 +52,7 @@ class Extended(EStep):
     ) -> tuple[Expected, Any]:
         """Trajectories at a step towards their mode, rows linearised there."""
         mode = find_mode(model, point, prior, 1, 0.0, joint=False)
-        information, score = model.of_biases(model.linearise(mode.point, expected=False))
+        information, score = model.of_sensors(model.linearise(mode.point, expected=False))
         return Expected(mode.point, information, score, 0.0, mode.refused), carry
 
 

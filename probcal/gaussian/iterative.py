@@ -39,8 +39,9 @@ class Iterative:
     exact: ClassVar[bool] = False
 
     def __call__(self, places: Entries, values: np.ndarray) -> Factor:
-        """Factorise the states; of a matrix without biases this is all."""
-        return Products(self.library, places, values) if len(places.blocks) else self.library(places, values)
+        """Factorise the states; of a matrix without biases, or without states, this is all."""
+        both = places.blocks.min(initial=places.size) % places.size
+        return Products(self.library, places, values) if both else self.library(places, values)
 
 
 class Products(Factor):

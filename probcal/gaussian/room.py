@@ -17,7 +17,7 @@ def check_room(model: Model) -> None:
     if dense_numbers(model) > MOST * ROOM:
         size = 8e-9 * dense_numbers(model)
         raise InputError(
-            f"the dense form of {model.biases} biases and {model.state_size} states takes {size:.0f} GB: EA(), MAP()"
-            " and Gibbs() fit a network of this size in sparse form, and the verbs take it; for other methods take"
+            f"the dense form of {model.biases} biases and {model.state_size} states takes {size:.0f} GB: EA(), MAP(),"
+            " EM() and Gibbs() fit a network of this size in sparse form, and the verbs take it; for other methods take"
             " fewer sensors or a shorter time"
         )

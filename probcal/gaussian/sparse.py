@@ -45,7 +45,8 @@ class SparseEngine:
     def at(self, model: Model, point: Point, rows: tuple[Linearised, ...] | None = None) -> SparseExpansion:
         """The posterior at a consistent point; rows as the caller linearised them."""
         form = jax.tree.leaves(replace(model, recursions=tuple(own._replace(tails=()) for own in model.recursions)))
-        if not (self._patterns and all(map(operator.is_, self._patterns[0][0], form))):
+        kept = self._patterns[0][0] if self._patterns else ()
+        if not (len(kept) == len(form) and all(map(operator.is_, kept, form))):
             self._patterns[:] = [(form, JointPrecision.of(model))]
         joint = self._patterns[0][1]
         rows = linearise_rows(model, point) if rows is None else tuple(rows)

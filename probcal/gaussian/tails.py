@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.gaussian.dense import DenseEngine
+from probcal.gaussian.dense import DenseExpansion
 from probcal.gaussian.engine import Engine, Expansion, Factors
 from probcal.gaussian.factor import COLUMNS
 from probcal.gaussian.information import update_levels
@@ -41,10 +41,9 @@ class Variances(NamedTuple):
         return cls(tuple(at.predicted(factors)), tuple(at.noises(factors)))
 
     @classmethod
-    def dense(cls, model: Model, point: Point, covariance: jax.Array) -> "Variances":
+    def dense(cls, at: DenseExpansion, covariance: jax.Array) -> "Variances":
         """Those for a covariance (M, M) of z; it can be traced."""
-        at = DenseEngine().at(model, point)
-        predicted = predicted_variances(model, at.rows, at.trajectories, covariance)
+        predicted = predicted_variances(at.model, at.rows, at.trajectories, covariance)
         return cls(predicted, noise_variances(at.trajectories, covariance))
 
 

@@ -1,62 +1,150 @@
 """Expectation maximisation: EM (ML and MAP) and the double loop EM-EA of Paper C."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from functools import partial
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from probcal.errors import InputError
-from probcal.gaussian.esteps import EStep, Extended, shorten
+from probcal.gaussian.choose import engine_named, estimates
+from probcal.gaussian.dense import DenseEngine
+from probcal.gaussian.engine import Engine, Factors, Group, evidence
+from probcal.gaussian.esteps import EStep, Expected, Extended, shorten
 from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import Point, cost, mixing_gain
 from probcal.gaussian.solves import Dense
+from probcal.gaussian.tails import Variances, renewed_noise
+from probcal.inference.ending import conclude_at
+from probcal.inference.engined import Engined
+from probcal.inference.loop import Pause, Trace
 from probcal.inference.method import Context, Given, MethodTask, ParticleSmoother, State
-from probcal.inference.run import Maximiser, learn, renew_noise, valued
+from probcal.inference.mixture import gaussian_at
+from probcal.inference.run import KernelClimb, Maximiser, course_of, learn, stepped, valued
 from probcal.model.model import Model
+from probcal.model.variants import biases_alone
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Precision, Prior
 from probcal.problem import Problem
+from probcal.results.answer import Answer
 
 EXTENDED = Extended()
 BY_PATHS = "Gaussian of the curvature of the marginal likelihood, by the slope of its score over filters"
 RIDGE = 1e-12  # of the information, where a flat prior meets a bias that no row reads
 
 
-def _inner(
-    model: Model, step: EStep, point: Point, prior: Precision, carry: Any, key: jax.Array
-) -> tuple[Point, jax.Array, jax.Array, Any]:
-    """One E and one M step (Paper A 15-21, Paper C 2c and 35); also the variances of z at fixed trajectories (36).
+class Biases(NamedTuple):
+    """The M step in kernels: the biases at fixed trajectories, by one matrix of all."""
 
-    Then whether both steps were refused, and what the E-step carries on.
-    """
-    expected, carry = step(model, point, prior, carry, key)
-    point = expected.point
-    biases = Dense.of(expected.information + prior.matrix() + RIDGE * jnp.eye(model.biases))
-    move = biases.solve(expected.score - prior.pull(point.z))
-    finite = jnp.all(jnp.isfinite(move))
-    move = jnp.where(jnp.isfinite(move), move, 0.0)
-    point, stuck = shorten(model, point, point._replace(z=point.z + move), prior, expected.slack)
-    return point, biases.marginals(), expected.refused & (stuck | ~finite), carry
+    def solved(self, model: Model, expected: Expected, prior: Precision) -> tuple[Any, Any]:
+        """The step (M,) of the biases (Paper C 35), and their variances (M,) at fixed trajectories (36)."""
+        information = model.between_biases(expected.information)
+        biases = Dense.of(information + prior.matrix() + RIDGE * jnp.eye(model.biases))
+        return biases.solve(expected.score - prior.pull(expected.point.z)), biases.marginals()
+
+    def spread(self, model: Model, point: Point, prior: Precision) -> Variances:
+        """Variances of which unknown noise follows, biases and trajectories both uncertain."""
+        at = DenseEngine().at(model, point)
+        return Variances.dense(at, Dense.of(at.eliminated.information + prior.matrix()).covariance())
 
 
-def _iterate(model: Model, prior: Prior, given: Given, state: State, inner: int, step: EStep) -> State:
-    """`inner` E and M steps, then the update of the precisions (Paper C 40) and of the levels."""
+class BiasesBy(NamedTuple):
+    """The same on any engine: no row couples the biases of two sensors but those that they share."""
+
+    engine: Engine
+    learns: bool  # whether precisions are, so that the variances matter
+
+    def solved(self, model: Model, expected: Expected, prior: Precision) -> tuple[Any, Any]:
+        """The step (M,) of the biases, and their variances (M,)."""
+        M, z = model.biases, expected.point.z
+        parts = model.each_block(expected.information)
+        groups = [Group(np.asarray(data.bias), own, np.zeros(data.bias.shape)) for _, data, _, own in parts]
+        factors = Factors.of(prior) + Factors.alone(np.full(M, RIDGE)) + Factors(tuple(groups))
+        at = self.engine.at(biases_alone(model), Point((), (), z, expected.point.levels), ())
+        move = at.solve(factors, np.asarray(expected.score - prior.pull(z)))
+        return move, at.marginals(factors, np.arange(M)[:, None])[:, 0, 0] if self.learns else np.zeros(M)
+
+    def spread(self, model: Model, point: Point, prior: Precision) -> Variances:
+        """Variances of which unknown noise follows."""
+        return Variances.of(self.engine.at(model, point), Factors.of(prior))
+
+
+@partial(jax.jit, static_argnums=0, inline=True)
+def _expected(step: EStep, *given: Any) -> tuple[Expected, Any]:
+    return step(*given)
+
+
+@partial(jax.jit, inline=True)
+def _moved(model: Model, expected: Expected, move: Any, prior: Precision) -> tuple[Point, jax.Array]:
+    """The point after a step of the biases, and whether both steps were refused."""
+    point, there = expected.point, jnp.isfinite(move)
+    after = point._replace(z=point.z + jnp.where(there, move, 0.0))
+    point, stuck = shorten(model, point, after, prior, expected.slack)
+    return point, expected.refused & (stuck | ~jnp.all(there))
+
+
+def _iterate(model: Model, prior: Prior, given: Given, state: State, method: "EM", biases: Biases | BiasesBy) -> State:
+    """`inner` E and M steps (Paper A 15-21, Paper C 2c), then new precisions (Paper C 40) and levels."""
     now = given.prior._replace(alpha=state.alpha)
     point, variance, refused, carry = state.point, jnp.zeros_like(state.alpha), state.refused, state.carry
-    seed, *seeds = jax.random.split(state.seed, inner + 1)
+    seed, *seeds = jax.random.split(state.seed, method.inner + 1)
     for own in seeds:
-        point, variance, stuck, carry = _inner(model, step, point, now, carry, own)
+        expected, carry = _expected(method.e_step, model, point, now, carry, own)
+        move, variance = biases.solved(model, expected, now)
+        point, stuck = _moved(model, expected, move, now)
         refused = refused & stuck
     alpha = learn(prior, given, state.alpha, jnp.zeros_like(variance), variance, point.z, "em")
-    model, state = renew_noise(model, state._replace(point=point), jnp.diag(variance))
-    point = state.point
+    if model.learns_noise:
+        model, point = renewed_noise(model, point, biases.spread(model, point, now))
+        state = state._replace(mixing=model.mixing)
+    return _valued(
+        model, prior, given, state._replace(point=point, alpha=alpha, refused=refused, seed=seed, carry=carry)
+    )
+
+
+@partial(jax.jit, static_argnames="prior", inline=True)
+def _valued(model: Model, prior: Prior, given: Given, state: State) -> State:
+    """The state with the log density there, and whether it stays."""
+    point, alpha = state.point, state.alpha
     after = given.prior._replace(alpha=alpha)
     free = jnp.where(given.surveyed, 0.0, prior.penalty(point.z, alpha) - 0.5 * alpha * point.z**2)
     value = mixing_gain(model) - cost(model, point, after) - jnp.sum(free)
     if prior.proper:
         value = value + 0.5 * after.log_determinant()
     done = jnp.abs(value - state.objective) < given.tolerance
-    return state._replace(point=point, alpha=alpha, objective=value, refused=refused, done=done, seed=seed, carry=carry)
+    return state._replace(objective=value, done=done)
+
+
+@dataclass(eq=False)
+class EngineEM(Engined, KernelClimb):
+    """EM on any engine: the trajectories by kernels, the biases and what is reported by the engine."""
+
+    whole: ClassVar[bool] = False
+
+    def step(self, state: State, count: int, pause: Pause) -> tuple[State, Trace]:
+        """One iteration."""
+        state = stepped(self, self.model, self.bare, self.given, state)
+        return state, jax.tree.map(lambda leaf: np.asarray(leaf)[None], course_of(state))
+
+    def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
+        """Inner EM steps, then new precisions."""
+        return _iterate(model, prior, given, state, self.method, BiasesBy(self.engine, prior.learns))
+
+    def ended(self, state: State, trace: Trace) -> bool:
+        """True where the density stays."""
+        return bool(state.done)
+
+    def outcome(self, state: State, course: Trace) -> Answer:
+        """The Gaussian at the last state, trajectories marginalised."""
+        problem, prior = self.problem.with_mixing(state.mixing), self.given.prior._replace(alpha=state.alpha)
+        at = self.engine.at(problem.model, state.point)
+        worth = evidence(at, prior)
+        posterior = gaussian_at(problem, self.prior, at, worth, prior)
+        return conclude_at(
+            problem, self.method, self.prior, posterior, course, converged=bool(state.done), evidence=worth.value,
+            stopped=self.context.monitor.stopped, refused=bool(state.refused),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -64,8 +152,8 @@ class EM(Maximiser):
     """Expectation maximisation of the biases: ML with `Flat`, MAP with `Gaussian` (Paper A 15-21, Paper C 27-36).
 
     `e_step` is a value: `Extended()` or, by sigma points, `Unscented()` or `Cubature()`. It stops when the joint log
-    density changes by less than `tolerance`; 0 runs all `iterations`, as the papers do. Raises `InputError` for an
-    E-step that is none.
+    density changes by less than `tolerance`; 0 runs all `iterations`, as the papers do. `engine` as in `EA`. Raises
+    `InputError` for an E-step that is none, or another engine.
 
     `Particles(500)` as E-step is Paper A's algorithm: any motion, roads too; it stops where the
     biases only scatter about a place. The intervals are by the slope of the score of the marginal
@@ -77,6 +165,7 @@ class EM(Maximiser):
     iterations: int = 500
     tolerance: float = 1e-5
     inner: int = 1
+    engine: str | Engine = "auto"
 
     name: ClassVar[str] = "EM"
     priors: ClassVar[tuple[type, ...]] = (Gaussian, Flat, Laplace)
@@ -89,6 +178,7 @@ class EM(Maximiser):
             )
         if self.inner < 1:
             raise InputError(f"{self.name}(inner={self.inner}): at least one inner iteration is needed")
+        object.__setattr__(self, "engine", engine_named(self.name, self.engine))
 
     @property
     def by_particles(self) -> bool:
@@ -103,12 +193,17 @@ class EM(Maximiser):
         """A climb, by particles where the E-step draws them."""
         if isinstance(self.e_step, ParticleSmoother):
             return self.e_step.task(self, problem, prior, start, context)
-        return super().task(problem, prior, start, context)
+        engine = self.expands_by(problem.model)
+        own = self, problem, prior, start, context
+        return super().task(*own[1:]) if engine is None else EngineEM(*own, engine=engine)
+
+    def lacking(self, prior: Prior, starts: int) -> str:
+        """What a climb takes on an engine that is not dense: only one that estimates lacks what precisions follow."""
+        return super().lacking(prior if estimates(self.engine) else Gaussian(), starts)
 
     def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """Inner EM steps, then new precisions."""
-        assert isinstance(self.e_step, EStep)
-        return _iterate(model, prior, given, state, self.inner, self.e_step)
+        return _iterate(model, prior, given, state, self, Biases())
 
     def begin(self, model: Model, start: Point) -> Any:
         """What the E-step carries to its first step."""

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple, cast
 
@@ -44,14 +44,33 @@ class HostState(NamedTuple):
 
 
 @dataclass(eq=False)
-class HostClimb(MethodTask):
+class Engined(MethodTask):
+    """A climb on an engine."""
+
+    engine: Engine = field(kw_only=True)
+
+    def beyond_memory(self, error: MemoryError) -> Answer:
+        """The answer without a factor where memory does not hold one; raises what to do where there is none."""
+        method, engine, prior = self.method, self.engine, self.prior
+        if not (engine.exact and method.engine == "auto" and isinstance(prior, (Gaussian, Flat))):
+            raise _memory(engine, self.problem.model) from None
+        other = replace(method, engine="iterative")
+        return cast("Answer", other.answer(self.problem, prior, self.start, self.context))
+
+    def singular(self, error: np.linalg.LinAlgError) -> Answer:
+        """Raises that the fit diverged, and which biases no row informs."""
+        factors = Factors.of(self.prior.precision(self.problem.labels, self.problem.surveyed))
+        raise diverged(self.problem, self.engine.at(self.problem.model, self.start), factors) from None
+
+
+@dataclass(eq=False)
+class HostClimb(Engined):
     """Climbs in turn to the mode of the biases and, where noise is not known, to that of largest evidence.
 
     An iteration is a step of the biases where noise is known, else a turn; it ends where a turn moves the evidence by
     less than the tolerance. Its iterations are steps, and the start.
     """
 
-    engine: Engine
     scales: Precision  # of the climb
     factors: Factors  # of the prior
     turns: int
@@ -69,7 +88,7 @@ class HostClimb(MethodTask):
         """The climb of a method that reports a Gaussian, or a mixture, at the mode."""
         scales = method.climbs_under(prior).precision(problem.labels, problem.surveyed)
         own = method.iterations, method.tolerance, method.integrates_places
-        return cls(method, problem, prior, start, context, engine, scales, Factors.of(scales), *own)
+        return cls(method, problem, prior, start, context, scales, Factors.of(scales), *own, engine=engine)
 
     @property
     def iterations(self) -> int:
@@ -160,18 +179,6 @@ class HostClimb(MethodTask):
             problem, method, prior, posterior, course, converged=bool(state.converged) and settled,
             evidence=worth.value, lost=lost, stopped=context.monitor.stopped, refused=bool(state.refused),
         )  # fmt: skip
-
-    def beyond_memory(self, error: MemoryError) -> Answer:
-        """The answer without a factor where memory does not hold one; raises what to do where there is none."""
-        method, engine, prior = self.method, self.engine, self.prior
-        if not (engine.exact and method.engine == "auto" and isinstance(prior, (Gaussian, Flat))):
-            raise _memory(engine, self.model) from None
-        other = replace(method, engine="iterative")
-        return cast("Answer", other.answer(self.problem, prior, self.start, self.context))
-
-    def singular(self, error: np.linalg.LinAlgError) -> Answer:
-        """Raises that the fit diverged, and which biases no row informs."""
-        raise diverged(self.problem, self.engine.at(self.model, self.start), self.factors) from None
 
 
 def _memory(engine: Engine, model: Model) -> FitError:

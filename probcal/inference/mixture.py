@@ -19,7 +19,7 @@ from probcal.inference.hierarchy import drawn_precisions, held, inclusions
 from probcal.inference.integrate import Integrated
 from probcal.inference.posed import Form
 from probcal.inference.propagate import Propagation
-from probcal.priors import Prior
+from probcal.priors import Gaussian, Precision, Prior
 from probcal.problem import Problem
 from probcal.results.answer import (
     CHAINS,
@@ -65,13 +65,18 @@ def gaussian(
     return Posterior(problem, prior, point, summary, known.pop("draw", draw_gaussian), **known)
 
 
-def gaussian_at(problem: Problem, prior: Prior, at: Expansion, worth: Estimate) -> Posterior:
-    """The Gaussian at a mode, expanded by any engine; `worth` is its log evidence."""
-    first = prior.precision(problem.labels, problem.surveyed)
+def gaussian_at(
+    problem: Problem, prior: Prior, at: Expansion, worth: Estimate, learnt: Precision | None = None
+) -> Posterior:
+    """The Gaussian at a mode, expanded by any engine; `worth` is its log evidence, `learnt` has precisions that are."""
+    first = prior.precision(problem.labels, problem.surveyed) if learnt is None else learnt
     factors = Factors.of(first)
     spread = at.spread(factors)
     blocks = blocks_under(at, factors, spread)
     declared = blocks if prior.proper else blocks.under_scales()
+    if prior.learns:
+        scales = Gaussian(correlation=prior.correlation).precision(problem.labels, problem.surveyed)
+        declared = blocks_under(at, Factors.of(scales))
     errors = {"sd_error": 0.5 * spread.error / spread.biases} if spread.error.any() else {}
     numbers = {"log_evidence_error": worth.error} if prior.proper and worth.error else {}
     return gaussian(

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -50,6 +50,8 @@ class KernelClimb(MethodTask):
 
     alpha: np.ndarray | None = None  # (M,) precisions to begin with, those of the prior if None
 
+    whole: ClassVar[bool] = True  # whether a state holds matrices of all biases
+
     def __post_init__(self) -> None:
         self.model, self.given = self.problem.model, given_of(self.method, self.problem, self.prior)
         self.bare = bare(self.method.climbs_under(self.prior))  # without what reaches kernels as arrays
@@ -61,9 +63,8 @@ class KernelClimb(MethodTask):
 
     def init(self) -> State:
         """The state before the first iteration."""
-        state = first_state(
-            self.given, self.model, self.start, self.method.begin(self.model, self.start), self.context.key
-        )
+        carry = self.method.begin(self.model, self.start)
+        state = first_state(self.given, self.model, self.start, carry, self.context.key, self.whole)
         far, alpha = (np.abs(self.start.z) > FAR) & ~held(self.prior, self.problem), self.alpha
         if alpha is None and self.prior.hierarchical and far.any():
             alpha = np.where(far, np.maximum(np.abs(self.start.z), FAR) ** -2.0, self.given.prior.alpha)
@@ -243,10 +244,10 @@ def given_of(method: Maximiser, problem: Problem, prior: Prior) -> Given:
     return Given(first_precision(problem, prior), *numbers)
 
 
-def first_state(given: Given, model: Model, start: Point, carry: Any, seed: jax.Array) -> State:
+def first_state(given: Given, model: Model, start: Point, carry: Any, seed: jax.Array, whole: bool = True) -> State:
     """State before the first iteration."""
     alpha, low = given.prior.alpha, np.array(-np.inf)
-    M = alpha.shape[0]
+    M = alpha.shape[0] if whole else 0
     nothing = LaplaceApproximation(*jax.device_put((np.zeros((M, M)), np.zeros((M, M)), np.zeros(M), low)))
     worst, refused, done = jax.device_put((low, np.array(True), np.array(False)))
     return State(start, alpha, nothing, worst, worst, worst, refused, done, seed, carry, model.mixing)
@@ -265,7 +266,7 @@ def renew_noise(model: Model, state: State, covariance: jax.Array, fresh: Any = 
     """
     if not model.learns_noise:
         return model, state
-    after, point = renewed_noise(model, state.point, Variances.dense(model, state.point, covariance))
+    after, point = renewed_noise(model, state.point, Variances.dense(DenseEngine().at(model, state.point), covariance))
     point, mixing = chosen(fresh, (state.point, state.mixing), (point, after.mixing))
     return model.with_mixing(mixing), state._replace(point=point, mixing=mixing)
 

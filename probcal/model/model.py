@@ -276,25 +276,35 @@ class Model(Stepwise):
 
     def of_biases(self, lins: Sequence[Linearised]) -> tuple[jax.Array, jax.Array]:
         """Rows compressed onto the biases at fixed trajectories: information (M, M), score (M,) (Paper C 35-36)."""
-        M = self.biases
-        G, g = jnp.zeros((M + 1, M + 1)), jnp.zeros(M + 1)
+        information, score = self.of_sensors(lins)
+        return self.between_biases(information), score
+
+    def of_sensors(self, lins: Sequence[Linearised]) -> tuple[Data, jax.Array]:
+        """Rows compressed onto the biases of each sensor of each block: information (S, p, p), score (M,)."""
+        found, score = list[jax.Array](), jnp.zeros(self.biases + 1)
         for _, data, _, lin in self.each_block(lins):
             S = data.bias.shape[0]
-            own = jax.ops.segment_sum(jnp.einsum("ncp,nc,ncq->npq", lin.bias, lin.weight, lin.bias), data.sensor, S)
+            own = jnp.einsum("ncp,nc,ncq->npq", lin.bias, lin.weight, lin.bias)
+            found.append(jax.ops.segment_sum(own, data.sensor, S))
             pull = jax.ops.segment_sum(jnp.einsum("ncp,nc->np", lin.bias, lin.score), data.sensor, S)
+            score = score.at[data.bias].add(pull)
+        return tuple(found), score[:-1]
+
+    def between_biases(self, parts: Sequence[jax.Array]) -> jax.Array:
+        """The matrix (M, M) of all biases, the sum of those of each sensor (S, p, p) of each block."""
+        M = self.biases
+        G = jnp.zeros((M + 1, M + 1))
+        for _, data, _, own in self.each_block(parts):
             G = G.at[data.bias[:, :, None], data.bias[:, None, :]].add(own)
-            g = g.at[data.bias].add(pull)
-        return G[:M, :M], g[:M]
+        return G[:M, :M]
 
     def curvature_by_biases(self, at: Where, weights: Sequence[jax.Array]) -> jax.Array:
         """Minus the second derivative (M, M) of the log-likelihood by the biases at given states, rows weighed (N,)."""
-        M = self.biases
-        G = jnp.zeros((M + 1, M + 1))
+        found = list[jax.Array]()
         for block, data, r, w in self.each_block(weights):
             rows = waist.curvature(block, data, self.vectors(r, at.states[r]), at.z, at.levels)
-            own = jax.ops.segment_sum(rows * w[:, None, None], data.sensor, data.bias.shape[0])
-            G = G.at[data.bias[:, :, None], data.bias[:, None, :]].add(own)
-        return G[:M, :M]
+            found.append(jax.ops.segment_sum(rows * w[:, None, None], data.sensor, data.bias.shape[0]))
+        return self.between_biases(found)
 
     def of_both(self, lins: Sequence[Linearised]) -> list[jax.Array]:
         """Cross information of states and biases, (E, n, M) of each recursion."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from probcal import linalg
 from probcal.model import rows
-from probcal.model.model import Model, Where
+from probcal.model.model import Data, Model, Where
 from probcal.model.rows import Block, Linearised, Rows
 
 FLOOR = 1e-10  # least variance along an axis of the sigma points
@@ -78,17 +78,15 @@ def regress_blocks(model: Model, point: Where, covariances: Sequence[jax.Array],
     return [_block(block, data, point, point.states[r], covariances[r], rule) for block, data, r in model.each_block()]
 
 
-def expect_biases(
-    model: Model, point: Where, covariances: Sequence[jax.Array], rule: Rule
-) -> tuple[jax.Array, jax.Array]:
-    """Information (M, M) and score (M,) of the biases, expected over the smoothed states (Paper A 15-21)."""
-    M = model.biases
-    information, score = jnp.zeros((M, M)), jnp.zeros(M)
+def expect_biases(model: Model, point: Where, covariances: Sequence[jax.Array], rule: Rule) -> tuple[Data, jax.Array]:
+    """Information (S, p, p) of the biases of each sensor, and score (M,), over the smoothed states (Paper A 15-21)."""
+    information, score = list[jax.Array](), jnp.zeros(model.biases)
     for block, data, r in model.each_block():
-        alone = replace(model, rows=(data,))  # the biases of one block
+        alone = replace(model, blocks=(block,), recursion=(r,), rows=(data,))
 
         def at(x: jax.Array, block: Block = block, data: Rows = data, alone: Model = alone) -> tuple:
-            return alone.of_biases([rows.linearise(block, data, x, point.z, point.levels, expected=False)])
+            (own,), pull = alone.of_sensors([rows.linearise(block, data, x, point.z, point.levels, expected=False)])
+            return own, pull
 
         if not block.used:
             G, g = at(point.states[r])
@@ -96,5 +94,6 @@ def expect_biases(
             points = _points(block, point.states[r], covariances[r], rule)
             each = jax.lax.map(at, points.states)
             G, g = (jnp.einsum("s,s...->...", points.weight, part) for part in each)
-        information, score = information + G, score + g
-    return information, score
+        information.append(G)
+        score = score + g
+    return tuple(information), score

@@ -28,6 +28,12 @@ def part(model: Model, r: int) -> Model:
     )
 
 
+def biases_alone(model: Model) -> Model:
+    """The model of the biases, without rows and trajectories."""
+    nothing: dict[str, Any] = dict.fromkeys(("blocks", "recursion", "recursions", "targets", "sampled", "rows"), ())
+    return replace(model, **nothing, tilt=None)
+
+
 def at_measured(model: Model) -> Model:
     """The model whose growing stds are those at the measured values, for starts; itself where none grows."""
     if not any(block.growing for block in model.blocks):
