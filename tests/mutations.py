@@ -205,7 +205,7 @@ MUTATIONS = [
     # inference/
     Mutation("alpha=jnp.where(fresh, state.alpha, alpha)", "alpha=alpha", "test_methods.py test_exact.py"),
     Mutation("- cost(model, point, held) - jnp.sum(penalty)", "- cost(model, point, held)", "test_methods.py"),
-    Mutation("expected.information + prior.matrix() + RIDGE", "expected.information + RIDGE", "test_methods.py"),
+    Mutation("information + prior.matrix() + RIDGE", "information + RIDGE", "test_methods.py"),
     Mutation("- 0.5 * alpha * point.z**2)", ")", "test_methods.py"),
     Mutation("max(float(best) - float(worth), 0.0)", "0.0", "test_guards.py"),
     Mutation("ABSURD = 100.0", "ABSURD = 1e40", "test_guards.py"),

@@ -215,9 +215,8 @@ class Drawn(EStep):
     def __call__(self, model, point, prior, carry, key):
         mode = find_mode(model, point, prior, 20, 1e-9, joint=False).point
         states = draw_trajectories(DenseEngine().at(model, mode), jnp.tile(mode.z, (self.count, 1)), key)
-        found = jax.vmap(lambda x: model.of_sensors(model.linearise(At(x, mode.z, mode.levels), expected=False)))(
-            states
-        )
+        at = At(states, mode.z, mode.levels)
+        found = jax.vmap(lambda x: model.of_sensors(model.linearise(at._replace(states=x), expected=False)))(states)
         information, score = jax.tree.map(lambda part: part.mean(0), found)
         return Expected(mode, information, score, jnp.inf, jnp.zeros((), bool)), carry + self.count
 

@@ -775,10 +775,10 @@ def test_every_verb_and_method_runs_on_every_engine_or_says_why_not(name, forced
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("method", [pc.EM(pc.Unscented(), iterations=20), pc.EMEA(iterations=20)], ids=lambda m: m.name)
-def test_em_on_any_engine_is_that_of_the_dense_one(method):
+@pytest.mark.parametrize("step", [pc.EM(pc.Unscented()), pc.EMEA()], ids=lambda own: own.name)
+def test_em_on_any_engine_is_that_of_the_dense_one(step):
     problem, start = engines.world().problem, engines.world().start
-    engined = (replace(method, engine=name) for name in ("dense", "superlu"))
+    engined = (replace(step, iterations=20, engine=name) for name in ("dense", "superlu"))
     one, other = (pc.fit(problem, own, start=start)["calibration"] for own in engined)
     for name in ("mean", "sd", "gamma", "precision"):
         np.testing.assert_allclose(other[name], one[name], rtol=1e-9)

@@ -23,7 +23,8 @@ class Expected(NamedTuple):
     """What an E-step leaves for the M-step."""
 
     point: Point  # the same biases, trajectories at the mode or mean of their density given these
-    information: Data  # (S, p, p) of the biases of each sensor of each block, trajectories fixed, expected over them
+    # (S, p, p) of the biases of each sensor of each block at fixed trajectories, expected over them
+    information: Data
     score: jax.Array  # (M,) likewise
     slack: float  # of the cost, by which a step of the biases may lie above: a mean is no mode
     refused: jax.Array  # () whether the step left its start for nothing better

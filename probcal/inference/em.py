@@ -34,11 +34,11 @@ BY_PATHS = "Gaussian of the curvature of the marginal likelihood, by the slope o
 RIDGE = 1e-12  # of the information, where a flat prior meets a bias that no row reads
 
 
-class Biases(NamedTuple):
+class MatrixStep(NamedTuple):
     """The M step in kernels: the biases at fixed trajectories, by one matrix of all."""
 
     def solved(self, model: Model, expected: Expected, prior: Precision) -> tuple[Any, Any]:
-        """The step (M,) of the biases (Paper C 35), and their variances (M,) at fixed trajectories (36)."""
+        """Step (M,) of the biases (Paper C 35), and their variances (M,) at fixed tracks (36)."""
         information = model.between_biases(expected.information)
         biases = Dense.of(information + prior.matrix() + RIDGE * jnp.eye(model.biases))
         return biases.solve(expected.score - prior.pull(expected.point.z)), biases.marginals()
@@ -46,11 +46,12 @@ class Biases(NamedTuple):
     def spread(self, model: Model, point: Point, prior: Precision) -> Variances:
         """Variances of which unknown noise follows, biases and trajectories both uncertain."""
         at = DenseEngine().at(model, point)
-        return Variances.dense(at, Dense.of(at.eliminated.information + prior.matrix()).covariance())
+        biases = Dense.of(at.eliminated.information + prior.matrix())
+        return Variances.dense(at, biases.covariance())
 
 
-class BiasesBy(NamedTuple):
-    """The same on any engine: no row couples the biases of two sensors but those that they share."""
+class EngineStep(NamedTuple):
+    """The same on any engine, of the information by sensor as factors."""
 
     engine: Engine
     learns: bool  # whether precisions are, so that the variances matter
@@ -59,11 +60,13 @@ class BiasesBy(NamedTuple):
         """The step (M,) of the biases, and their variances (M,)."""
         M, z = model.biases, expected.point.z
         parts = model.each_block(expected.information)
-        groups = [Group(np.asarray(data.bias), own, np.zeros(data.bias.shape)) for _, data, _, own in parts]
+        groups = (Group(np.asarray(data.bias), own, np.zeros(data.bias.shape)) for _, data, _, own in parts)
         factors = Factors.of(prior) + Factors.alone(np.full(M, RIDGE)) + Factors(tuple(groups))
         at = self.engine.at(biases_alone(model), Point((), (), z, expected.point.levels), ())
         move = at.solve(factors, np.asarray(expected.score - prior.pull(z)))
-        return move, at.marginals(factors, np.arange(M)[:, None])[:, 0, 0] if self.learns else np.zeros(M)
+        if not self.learns:
+            return move, np.zeros(M)
+        return move, at.marginals(factors, np.arange(M)[:, None])[:, 0, 0]
 
     def spread(self, model: Model, point: Point, prior: Precision) -> Variances:
         """Variances of which unknown noise follows."""
@@ -84,8 +87,10 @@ def _moved(model: Model, expected: Expected, move: Any, prior: Precision) -> tup
     return point, expected.refused & (stuck | ~jnp.all(there))
 
 
-def _iterate(model: Model, prior: Prior, given: Given, state: State, method: "EM", biases: Biases | BiasesBy) -> State:
-    """`inner` E and M steps (Paper A 15-21, Paper C 2c), then new precisions (Paper C 40) and levels."""
+def _iterate(
+    model: Model, prior: Prior, given: Given, state: State, method: "EM", biases: MatrixStep | EngineStep
+) -> State:
+    """`inner` E and M steps (Paper A 15-21, Paper C 2c), then new precisions (40) and levels."""
     now = given.prior._replace(alpha=state.alpha)
     point, variance, refused, carry = state.point, jnp.zeros_like(state.alpha), state.refused, state.carry
     seed, *seeds = jax.random.split(state.seed, method.inner + 1)
@@ -118,7 +123,7 @@ def _valued(model: Model, prior: Prior, given: Given, state: State) -> State:
 
 @dataclass(eq=False)
 class EngineEM(Engined, KernelClimb):
-    """EM on any engine: the trajectories by kernels, the biases and what is reported by the engine."""
+    """EM on any engine: trajectories by kernels, the biases and their covariance by the engine."""
 
     whole: ClassVar[bool] = False
 
@@ -129,7 +134,8 @@ class EngineEM(Engined, KernelClimb):
 
     def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """Inner EM steps, then new precisions."""
-        return _iterate(model, prior, given, state, self.method, BiasesBy(self.engine, prior.learns))
+        biases = EngineStep(self.engine, prior.learns)
+        return _iterate(model, prior, given, state, self.method, biases)
 
     def ended(self, state: State, trace: Trace) -> bool:
         """True where the density stays."""
@@ -137,13 +143,14 @@ class EngineEM(Engined, KernelClimb):
 
     def outcome(self, state: State, course: Trace) -> Answer:
         """The Gaussian at the last state, trajectories marginalised."""
-        problem, prior = self.problem.with_mixing(state.mixing), self.given.prior._replace(alpha=state.alpha)
+        problem = self.problem.with_mixing(state.mixing)
+        prior = self.given.prior._replace(alpha=state.alpha)
         at = self.engine.at(problem.model, state.point)
         worth = evidence(at, prior)
         posterior = gaussian_at(problem, self.prior, at, worth, prior)
         return conclude_at(
-            problem, self.method, self.prior, posterior, course, converged=bool(state.done), evidence=worth.value,
-            stopped=self.context.monitor.stopped, refused=bool(state.refused),
+            problem, self.method, self.prior, posterior, course, converged=bool(state.done),
+            evidence=worth.value, stopped=self.context.monitor.stopped, refused=bool(state.refused),
         )  # fmt: skip
 
 
@@ -198,12 +205,12 @@ class EM(Maximiser):
         return super().task(*own[1:]) if engine is None else EngineEM(*own, engine=engine)
 
     def lacking(self, prior: Prior, starts: int) -> str:
-        """What a climb takes on an engine that is not dense: only one that estimates lacks what precisions follow."""
+        """As every climb; precisions may be learnt where an engine is exact."""
         return super().lacking(prior if estimates(self.engine) else Gaussian(), starts)
 
     def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """Inner EM steps, then new precisions."""
-        return _iterate(model, prior, given, state, self, Biases())
+        return _iterate(model, prior, given, state, self, MatrixStep())
 
     def begin(self, model: Model, start: Point) -> Any:
         """What the E-step carries to its first step."""

@@ -97,8 +97,8 @@ class GibbsChains(Chains):
 
     def init(self) -> SweepState:
         """Chains about the mode under the declared scales."""
-        own, alone = (self.engine, self.first, self.factors, CLIMB, 1e-3), Context(self.key)
-        climb = HostClimb(self.method, self.problem, self.prior, self.start, alone, *own)
+        own, alone = (self.first, self.factors, CLIMB, 1e-3), Context(self.key)
+        climb = HostClimb(self.method, self.problem, self.prior, self.start, alone, *own, engine=self.engine)
         self.mode = climb.at(alone.run(climb)[0])
         self.model = self.mode.model
         return self.begun()

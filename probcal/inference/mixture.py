@@ -68,7 +68,7 @@ def gaussian(
 def gaussian_at(
     problem: Problem, prior: Prior, at: Expansion, worth: Estimate, learnt: Precision | None = None
 ) -> Posterior:
-    """The Gaussian at a mode, expanded by any engine; `worth` is its log evidence, `learnt` has precisions that are."""
+    """The Gaussian at a mode on any engine; `worth` is its log evidence, `learnt` has precisions."""
     first = prior.precision(problem.labels, problem.surveyed) if learnt is None else learnt
     factors = Factors.of(first)
     spread = at.spread(factors)

@@ -280,7 +280,7 @@ class Model(Stepwise):
         return self.between_biases(information), score
 
     def of_sensors(self, lins: Sequence[Linearised]) -> tuple[Data, jax.Array]:
-        """Rows compressed onto the biases of each sensor of each block: information (S, p, p), score (M,)."""
+        """Rows compressed onto biases by sensor: information (S, p, p) of each block, score (M,)."""
         found, score = list[jax.Array](), jnp.zeros(self.biases + 1)
         for _, data, _, lin in self.each_block(lins):
             S = data.bias.shape[0]
@@ -291,7 +291,7 @@ class Model(Stepwise):
         return tuple(found), score[:-1]
 
     def between_biases(self, parts: Sequence[jax.Array]) -> jax.Array:
-        """The matrix (M, M) of all biases, the sum of those of each sensor (S, p, p) of each block."""
+        """The sum (M, M) of matrices (S, p, p) by sensor of each block."""
         M = self.biases
         G = jnp.zeros((M + 1, M + 1))
         for _, data, _, own in self.each_block(parts):
@@ -303,7 +303,8 @@ class Model(Stepwise):
         found = list[jax.Array]()
         for block, data, r, w in self.each_block(weights):
             rows = waist.curvature(block, data, self.vectors(r, at.states[r]), at.z, at.levels)
-            found.append(jax.ops.segment_sum(rows * w[:, None, None], data.sensor, data.bias.shape[0]))
+            rows = rows * w[:, None, None]
+            found.append(jax.ops.segment_sum(rows, data.sensor, data.bias.shape[0]))
         return self.between_biases(found)
 
     def of_both(self, lins: Sequence[Linearised]) -> list[jax.Array]:

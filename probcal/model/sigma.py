@@ -79,13 +79,14 @@ def regress_blocks(model: Model, point: Where, covariances: Sequence[jax.Array],
 
 
 def expect_biases(model: Model, point: Where, covariances: Sequence[jax.Array], rule: Rule) -> tuple[Data, jax.Array]:
-    """Information (S, p, p) of the biases of each sensor, and score (M,), over the smoothed states (Paper A 15-21)."""
+    """Information (S, p, p) by sensor and score (M,), over the smoothed states (Paper A 15-21)."""
     information, score = list[jax.Array](), jnp.zeros(model.biases)
     for block, data, r in model.each_block():
         alone = replace(model, blocks=(block,), recursion=(r,), rows=(data,))
 
         def at(x: jax.Array, block: Block = block, data: Rows = data, alone: Model = alone) -> tuple:
-            (own,), pull = alone.of_sensors([rows.linearise(block, data, x, point.z, point.levels, expected=False)])
+            lin = rows.linearise(block, data, x, point.z, point.levels, expected=False)
+            (own,), pull = alone.of_sensors([lin])
             return own, pull
 
         if not block.used:

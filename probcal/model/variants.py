@@ -30,8 +30,10 @@ def part(model: Model, r: int) -> Model:
 
 def biases_alone(model: Model) -> Model:
     """The model of the biases, without rows and trajectories."""
-    nothing: dict[str, Any] = dict.fromkeys(("blocks", "recursion", "recursions", "targets", "sampled", "rows"), ())
-    return replace(model, **nothing, tilt=None)
+    none = ()
+    return replace(
+        model, blocks=none, recursion=none, recursions=none, targets=none, sampled=none, rows=none, tilt=None
+    )  # fmt: skip
 
 
 def at_measured(model: Model) -> Model:
