@@ -59,8 +59,9 @@ class Engined(MethodTask):
 
     def singular(self, error: np.linalg.LinAlgError) -> Answer:
         """Raises that the fit diverged, and which biases no row informs."""
-        factors = Factors.of(self.prior.precision(self.problem.labels, self.problem.surveyed))
-        raise diverged(self.problem, self.engine.at(self.problem.model, self.start), factors) from None
+        problem, own = self.problem, self.prior.precision(self.problem.labels, self.problem.surveyed)
+        at = self.engine.at(problem.model, self.start)
+        raise diverged(problem, at, Factors.of(own)) from None
 
 
 @dataclass(eq=False)

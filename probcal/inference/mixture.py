@@ -68,7 +68,7 @@ def gaussian(
 def gaussian_at(
     problem: Problem, prior: Prior, at: Expansion, worth: Estimate, learnt: Precision | None = None
 ) -> Posterior:
-    """The Gaussian at a mode on any engine; `worth` is its log evidence, `learnt` has precisions."""
+    """The Gaussian at a mode on any engine, of log evidence `worth`, under precisions `learnt`."""
     first = prior.precision(problem.labels, problem.surveyed) if learnt is None else learnt
     factors = Factors.of(first)
     spread = at.spread(factors)

@@ -30,10 +30,9 @@ def part(model: Model, r: int) -> Model:
 
 def biases_alone(model: Model) -> Model:
     """The model of the biases, without rows and trajectories."""
-    none = ()
-    return replace(
-        model, blocks=none, recursion=none, recursions=none, targets=none, sampled=none, rows=none, tilt=None
-    )  # fmt: skip
+    parts = ("blocks", "recursion", "recursions", "targets", "sampled", "rows")
+    nothing: dict[str, Any] = dict.fromkeys(parts, ())
+    return replace(model, **nothing, tilt=None)
 
 
 def at_measured(model: Model) -> Model:
