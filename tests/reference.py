@@ -16,7 +16,6 @@ from probcal.gaussian.engine import Estimate, Sampled, Spread
 from probcal.gaussian.jointly import Variables
 from probcal.gaussian.linearised import given_biases, linearise_rows
 from probcal.gaussian.mode import eliminate_rows, factors, find_tracks, log_likelihood, mixing_gain
-from probcal.model.model import scaled
 from probcal.motion import ConstantVelocity, Motion, RandomWalk, Static, White
 
 AXES = "xyz"
@@ -499,9 +498,6 @@ class Naive:
         found = self.covariance(factors) @ np.concatenate([by_states, slopes.z])
         states = (np.einsum("enu,uk->enk", own, found[: self.U]) for own in self.maps)
         return Variables(tuple(states), found[self.U :])
-
-    def weighed(self, weights):
-        return Naive(self.model.weighted(weights), self.point, scaled(self.rows, weights))
 
 
 @jax.jit

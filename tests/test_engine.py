@@ -95,9 +95,6 @@ MEMBERS = {  # what each is asked with
     "predicted": lambda own, factors, _: own.predicted(factors),
     "leverages": lambda own, factors, _: own.leverages(factors),
     "noise_score": lambda own, factors, _: noise_score(own, factors),
-    "weighed": lambda own, factors, M: (
-        own.weighed(some_rows(own.model)).solve(factors, np.ones(M)), own.weighed(some_rows(own.model)).apply(np.eye(M))
-    ),
     "respond": lambda own, factors, M: responses_of(own, factors, M),
 }  # fmt: skip
 
@@ -139,11 +136,6 @@ def test_the_old_word_for_an_engine_says_the_new_one():
             assert pc.MAP(**given).engine == "iterative"
     with pytest.warns(FutureWarning, match='is EA\\(engine="(cholmod|superlu)"\\) now'):
         pc.EA(engine="sparse")
-
-
-def some_rows(model):
-    """Weights (N, 1) that leave every third row out and count every second of the rest by a half."""
-    return tuple(jnp.asarray(np.resize([0.0, 0.5, 1.0], len(data.epoch))[:, None]) for data in model.rows)
 
 
 @pytest.mark.parametrize("name", WORLDS)

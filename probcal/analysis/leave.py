@@ -8,6 +8,7 @@ predictive density of what was left out is the difference of two Laplace evidenc
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,92 +17,54 @@ import numpy as np
 import xarray as xr
 from scipy import special
 
-from probcal.gaussian.engine import Expansion, Factors
-from probcal.gaussian.mode import Point, cost, find_mode, smooth_tracks
+from probcal.gaussian.climb import climb_to_mode
+from probcal.gaussian.engine import Factors, evidence
+from probcal.gaussian.mode import smooth_tracks
 from probcal.gaussian.places import tilt_at
 from probcal.inference.fitted import Judged
 from probcal.inference.pose import TAILED
 from probcal.inference.psis import smoothed
-from probcal.linalg import log_determinant
-from probcal.model import variants
-from probcal.model.model import Model
-from probcal.model.rows import Linearised, standardised
-from probcal.priors import Precision
+from probcal.model.rows import standardised
 from probcal.results.read import summed_log_likelihood
 
 STEPS = 20  # Gauss-Newton steps of a refit
 TOLERANCE = 1e-5  # nats
 WORK = 3e9  # operations of all eliminations beyond which a refit is one step from the fit
 PLACED = 100  # refits up to which the places of targets at rest are integrated anew
-PINNED = 1e12  # precision by which a bias is held at zero
+PINNED = 1e12  # precision that holds a bias at zero, and leaves the evidence as if it were fixed there
 TARGETS = 32  # beyond which targets are not left out one by one
 
 
-def _stepped(at: Expansion, factors: Factors, held: np.ndarray, prior: Precision) -> tuple[float, float]:
-    """Evidence, by Laplace's formula, and least squares one Fisher-scoring step from a point, biases `held` (M,) at 0.
+class _Refits(NamedTuple):
+    """Refits of a problem with data masked and other precisions."""
 
-    The step counts only where it raises the density: at a mode it changes nothing, on a linear problem it is exact.
-    """
-    z = np.asarray(at.point.z)
-    pinned = factors + Factors.alone(np.where(held, PINNED, 0.0))
-    start = at.point._replace(z=jax.device_put(np.where(held, 0.0, z)))
-    moved = at.moved(at.solve(pinned, np.asarray(at.slope()) + pinned.pull(z)))
-    least, square = _ends(at.model, at.point, start, moved, prior, at.rows)
-    volume = at.log_det(pinned).value - np.count_nonzero(held) * np.log(PINNED) + float(at.eliminated.logdet)
-    return 0.5 * (_logdet(prior, held) - volume) - float(least), float(square)
+    fit: Judged
+    quick: bool  # one step from the fit instead of a search
+    placed: bool  # with the places of static targets integrated anew
 
-
-@jax.jit
-def _ends(
-    model: Model, point: Point, start: Point, moved: Point, prior: Precision, lins: Sequence[Linearised]
-) -> tuple[jax.Array, jax.Array]:
-    """The lesser cost of a start and of a step from it, and the least squares of all at the step."""
-    ends = jax.tree.map(lambda a, b: jnp.stack([a, b]), start, moved)
-    before, after = jax.vmap(lambda end: cost(model, end, prior))(ends)
-    square = sum(jnp.sum(u**2) for u in moved.noises) + prior.square(moved.z)
-    dx = model.each(lambda _, x, before_: (x - before_)[:, :, None], moved.states, point.states)
-    for lin, change in zip(lins, model.responses(lins, dx, (moved.z - point.z)[:, None]), strict=True):
-        square = square + jnp.sum((standardised(lin.score, lin.weight) - jnp.sqrt(lin.weight) * change[:, :, 0]) ** 2)
-    return jnp.where(after < before, after, before), square
-
-
-class _Refits:
-    """Refits of a problem with data masked, precisions changed or biases held at 0."""
-
-    def __init__(self, fit: Judged, jobs: int):
+    @classmethod
+    def of(cls, fit: Judged, jobs: int) -> _Refits:
+        """Of a fit, for this many jobs."""
         model = fit.problem.model
-        work = 2.0 * jobs * model.state_size * model.biases**2
-        self.fit, self.quick = fit, work > WORK or not fit.whole
-        self.placed = fit.problem.tilted and jobs <= PLACED and not self.quick
+        quick = not fit.whole or 2.0 * jobs * model.state_size * model.biases**2 > WORK
+        return cls(fit, quick, fit.problem.tilted and jobs <= PLACED and not quick)
 
-    def run(self, out: np.ndarray | None, alpha: np.ndarray, held: np.ndarray) -> tuple[float, float]:
-        """Evidence and least squares without the rows (of the table) in `out`, at precisions alpha (M,)."""
-        fit, model, point, at = self.fit, self.fit.problem.model, self.fit.point, self.fit.expansion
-        prior = fit.prior._replace(alpha=jax.device_put(alpha))
-        weights = None if out is None else [~out[index][:, None] for index in fit.problem.row_index]
-        if not self.quick:
-            model = model if weights is None else model.weighted(weights)
-            if weights is not None and self.placed:
+    def run(self, out: np.ndarray | None, alpha: np.ndarray) -> tuple[float, float]:
+        """Evidence by Laplace's formula, and least squares, at the mode without the rows (of the table) in `out`."""
+        fit, model, point = self.fit, self.fit.problem.model, self.fit.point
+        if out is not None:
+            model = model.weighted([~out[index][:, None] for index in fit.problem.row_index])
+            if self.placed:
                 point = smooth_tracks(model, point)
                 model = model.with_tilt(tilt_at(model, point))
-            frozen = variants.without(model, held)
-            start = point._replace(z=jax.device_put(np.where(held, 0.0, point.z)))
-            at = fit.engine.at(frozen, find_mode(frozen, start, prior, STEPS, TOLERANCE).point)
-        elif weights is not None:
-            at = at.weighed(tuple(jnp.asarray(own) for own in weights))
-        return _stepped(at, Factors.of(prior), held, prior)
-
-
-def _logdet(prior: Precision, held: np.ndarray) -> float:
-    """Log determinant of the prior of the biases that are not held, a flat one counted as one."""
-    alpha = np.where((np.asarray(prior.alpha) > 0) & ~held, prior.alpha, 1.0)
-    total = float(np.log(alpha).sum())
-    for members, added in prior.coupling:
-        left = ~held[members]
-        own = np.diag(alpha[members][left])
-        both = own + np.asarray(added)[np.ix_(left, left)]
-        total += float(log_determinant(both) - log_determinant(own))
-    return total
+        prior = fit.prior._replace(alpha=jax.device_put(alpha))
+        point = point._replace(z=jax.device_put(np.where(alpha < PINNED, point.z, 0.0)))
+        expand = partial(fit.engine.at if self.quick else fit.engine.settled, model)
+        how = (1, 0.0) if self.quick else (STEPS, TOLERANCE)
+        at, factors = climb_to_mode(expand, point, Factors.of(prior), *how, marginal=False).at, Factors.of(prior)
+        roots = [standardised(lin.score, lin.weight) for lin in at.rows]
+        square = sum(float(jnp.sum(own**2)) for own in (*roots, *at.point.noises)) + float(prior.square(at.point.z))
+        return evidence(at, prior, factors).value, square
 
 
 class Left(NamedTuple):
@@ -129,12 +92,13 @@ def leave_out(fit: Judged, name: str, chosen: Sequence[str]) -> Left | None:
     owner, names = data.target, list(data.target_names)
     if sensors:
         owner, names = data.sensor, [placed.name for placed in problem.network.sensors]
-    refits = _Refits(fit, (3 if sensors else 1) * len(chosen))
-    whole = [] if sensors else [refits.run(None, alpha, none)]
+    refits = _Refits.of(fit, (3 if sensors else 1) * len(chosen))
+    whole = [] if sensors else [refits.run(None, alpha)]
     for k in map(names.index, chosen):
         own = readers[k] & (readers.sum(0) == 1) if sensors else none
         wide = np.where(own & ~problem.surveyed, 1.0, alpha)
-        rows.append([refits.run(owner == k, wide, none), *(whole or [refits.run(None, wide, h) for h in (none, own)])])
+        stated = np.where(own, PINNED, wide)
+        rows.append([refits.run(owner == k, wide), *(whole or [refits.run(None, how) for how in (wide, stated)])])
     found, count = np.array(rows), fit.data[name].value_counts()[list(chosen)].to_numpy()  # found (groups, 2 or 3, 2)
     elpd, nis = np.moveaxis(found[:, 1:] - found[:, :1], 2, 0) / np.stack([np.ones(len(count)), count])[:, :, None]
     values = {"elpd": elpd[:, 0], "rest_nis": nis[:, 0]}

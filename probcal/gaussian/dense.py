@@ -26,7 +26,7 @@ from probcal.gaussian.marginal import volume_slope
 from probcal.gaussian.mode import SETTLED, TRACK_STEPS, Compressed, Eliminated, Point, find_tracks, follow
 from probcal.gaussian.solves import Dense
 from probcal.linalg import without_negative
-from probcal.model.model import Data, Model, scaled
+from probcal.model.model import Data, Model
 from probcal.model.rows import Linearised
 
 
@@ -182,10 +182,6 @@ class DenseExpansion:
     def variances(self, covariance: jax.Array) -> tuple[jax.Array, ...]:
         """Variance (E, n) of every state of each recursion, for a covariance (M, M) of the biases."""
         return state_variances(self.trajectories, covariance)
-
-    def weighed(self, weights: Data) -> DenseExpansion:
-        """The same point with every datum counted by a weight (N, C) or (N, 1): 0 leaves it out."""
-        return DenseEngine().at(self.model.weighted(weights), self.point, scaled(self.rows, weights))
 
 
 _solved = jax.jit(Dense.of)

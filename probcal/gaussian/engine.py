@@ -196,9 +196,6 @@ class Expansion(Protocol):
         """Variance (E, n) of every state where the biases have the covariance root root', root (M,
         R)."""
 
-    def weighed(self, weights: Data) -> Expansion:
-        """The same point with every datum counted by a weight (N, C) or (N, 1): 0 leaves it out."""
-
 
 class Engine(Protocol):
     """A way to linearise and solve."""

@@ -20,7 +20,7 @@ from probcal.gaussian.jointly import times_weights
 from probcal.gaussian.linearised import GivenBiases, given_biases, linearise_rows
 from probcal.gaussian.marginal import volume_slope
 from probcal.gaussian.mode import SETTLED, TRACK_STEPS, Eliminated, Point, factors, find_tracks, inverse_factors
-from probcal.model.model import Data, Model, scaled
+from probcal.model.model import Model
 from probcal.model.rows import Linearised
 
 WHOLE = 600  # biases up to which a matrix of all is made on request (its eigenvalues take 0.2 s)
@@ -248,11 +248,6 @@ class SparseExpansion:
             moved += np.sum(factor.solve(pulled if isinstance(pulled, np.ndarray) else pulled.toarray()) ** 2, 1)
         parts = self.model.each_layout(self.held_states, self.joint.state_values(moved))
         return [np.diagonal(np.asarray(held), axis1=1, axis2=2) + own for _, held, own in parts]
-
-    def weighed(self, weights: Data) -> SparseExpansion:
-        """The same point with every datum counted by a weight (N, C) or (N, 1): 0 leaves it out."""
-        rows = scaled(self.rows, weights)
-        return SparseExpansion(self.model.weighted(weights), self.point, rows, self.joint, self.library)
 
 
 @jax.jit

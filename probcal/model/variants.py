@@ -158,9 +158,3 @@ def placed(model: Model, mine: Sequence[jax.Array], place: jax.Array) -> Model:
         return {"pose": data.pose.at[:, 0, : len(place)].set(first)}
 
     return model.with_rows(moved, mine)
-
-
-def without(model: Model, held: np.ndarray) -> Model:
-    """The model that does not feel the biases in `held` (M,), which stay columns."""
-    felt = np.append(~held, True)
-    return model.with_rows(lambda data: {"scale": np.asarray(data.scale) * felt[np.asarray(data.bias)]})
