@@ -13,7 +13,7 @@ import numpy as np
 
 from probcal import linalg
 from probcal.gaussian.linearised import linearise_rows
-from probcal.gaussian.mode import Point, compress
+from probcal.gaussian.mode import Point
 from probcal.linalg import orthogonalise, spectrum
 from probcal.model import variants
 from probcal.model.model import Model
@@ -23,7 +23,7 @@ from probcal.motion import Known, as_motion
 from probcal.problem import Problem
 
 NULL = 1e-10  # share of information left below which a direction is a gauge
-CLOSE = 1e-6  # share below which a direction is looked at again, without cancellation
+CLOSE = 1e-6  # the same of a direction that is given, and may lie near one
 HELD = 1e30  # precision of a state that is known
 ENOUGH = 0.5  # share of the data in epochs with more data than unknowns from which on a gauge can be counted
 
@@ -41,19 +41,6 @@ class Gauge(NamedTuple):
 
     basis: np.ndarray  # (M, k) in z, orthonormal
     countable: bool  # whether enough epochs have more data than unknowns
-
-
-@jax.jit
-def free_states(model: Model, lins: tuple[Linearised, ...], hold: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
-    """Information (M, M) about the biases with the states free but for the precisions `hold` (E, n), and with them
-    known."""
-    compressed = compress(model, lins)
-    information = compressed.information
-    for _, (J, _), cross, precision in model.each_layout(compressed.states, compressed.crosses, hold):
-        root = linalg.semi_cholesky(J + jax.vmap(jnp.diag)(precision))
-        flat = linalg.forward(root, cross).reshape(-1, cross.shape[2])
-        information = information - linalg.gram(flat)
-    return information, compressed.information
 
 
 @jax.jit
@@ -95,22 +82,22 @@ def gauge(problem: Problem, point: Point) -> Gauge:
     Surveys count as rows. The count is exact where the epochs have more data than unknowns; where most have not,
     as with one range at a time, `countable` is False: what is fixed there hangs on the motion.
     """
-    model, hold = problem.model, held_states(problem)
-    lins, survey = linearise_rows(model, point), problem.surveyed.astype(float)
-    free, known = (np.asarray(part) for part in free_states(model, lins, hold))
-    information, alone = free + np.diag(survey), np.diag(known) + survey
-    unit = 1 / np.sqrt(np.where(alone > 0, alone, 1.0))
-    values, vectors = spectrum(information * np.outer(unit, unit))
-    near = unit[:, None] * vectors[:, values < CLOSE]
-    found = within(model, lins, hold, jax.device_put(near))
-    exact = np.asarray(found.left) + near.T @ (survey[:, None] * near)
-    values, turned = spectrum(0.5 * (exact + exact.T))
-    return Gauge(orthogonalise(near @ turned[:, values < NULL]), _countable(problem, found.ranks))
+    found = _within(problem, point, np.eye(problem.model.biases))
+    survey = problem.surveyed.astype(float)
+    known = np.asarray(found.known) + survey
+    unit = 1 / np.sqrt(np.where(known > 0, known, 1.0))
+    values, vectors = spectrum((np.asarray(found.left) + np.diag(survey)) * np.outer(unit, unit))
+    return Gauge(orthogonalise(unit[:, None] * vectors[:, values < NULL]), _countable(problem, found.ranks))
+
+
+def _within(problem: Problem, point: Point, basis: np.ndarray) -> Within:
+    model = problem.model
+    return within(model, linearise_rows(model, point), held_states(problem), jax.device_put(basis))
 
 
 def unfixed(problem: Problem, point: Point, vectors: np.ndarray) -> np.ndarray:
     """Which of some combinations (M, k) no row fixes: each by itself, where the biases are too many for `gauge`."""
-    found = within(problem.model, linearise_rows(problem.model, point), held_states(problem), jax.device_put(vectors))
+    found = _within(problem, point, vectors)
     survey = (problem.surveyed[:, None] * vectors**2).sum(0)
     left, known = np.diagonal(np.asarray(found.left)) + survey, np.asarray(found.known) + survey
     return (left < CLOSE * np.maximum(known, np.finfo(float).tiny)) & _countable(problem, found.ranks)
