@@ -24,10 +24,6 @@ class DirectionTrack(Protocol):
         """Places (T, d) relative to the sensor."""
 
     @property
-    def velocity(self) -> np.ndarray:
-        """Velocities (T, d)."""
-
-    @property
     def spread(self) -> np.ndarray:
         """Covariances (T, d, d) of the places."""
 
@@ -49,7 +45,7 @@ class Array(NamedTuple):
 
 
 class _Path(NamedTuple):
-    """A path in a common frame: times (T,), places (T, d), covariances (T, d, d)."""
+    """A path: times (T,), places (T, d), covariances (T, d, d)."""
 
     time: np.ndarray
     place: np.ndarray
@@ -60,17 +56,10 @@ class _Path(NamedTuple):
         place = np.stack([np.interp(time, self.time, column) for column in self.place.T], -1)
         return place, self.spread[np.searchsorted(self.time, time).clip(0, len(self.time) - 1)]
 
-
-def _at(track: DirectionTrack, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places (T, d) of a sensor's own track at times within it, straight on from the nearest, covariances (T, d, d)."""
-    near = np.abs(time[:, None] - track.time).argmin(1)
-    return track.place[near] + (time - track.time[near])[:, None] * track.velocity[near], track.spread[near]
-
-
-def _common(a: np.ndarray, b: np.ndarray) -> np.ndarray | None:
-    """Times that two tracks share, or None."""
-    low, high = max(a[0], b[0]), min(a[-1], b[-1])
-    return np.linspace(low, high, POINTS) if high > low else None
+    def common(self, other: "_Path") -> np.ndarray | None:
+        """Times that both have, or None."""
+        low, high = max(self.time[0], other.time[0]), min(self.time[-1], other.time[-1])
+        return np.linspace(low, high, POINTS) if high > low else None
 
 
 def match(
@@ -101,116 +90,88 @@ def match(
     first = max(sensors, key=lambda s: rows[s]) if reference is None else reference
     if first not in sensors:
         raise InputError(f'match: reference "{reference}" has no track; give one of {", ".join(sensors)}')
-    d = next(iter(tracks.values())).place.shape[1]
-    position, rotation = {first: np.zeros(d)}, {first: np.eye(d)}
-    paths: dict[str, _Path] = {}
-    opened: list[str] = []
-    while True:
-        moved = _reach_targets(tracks, position, rotation, paths)
-        moved |= _reach_sensors(tracks, position, rotation, paths, opened, level)
-        if not moved:
-            break
-    if len(position) < 2:
+    scene = _Scene({key: _Path(own.time, own.place, own.spread) for key, own in tracks.items()}, sensors, first, level)
+    while scene.grown():
+        pass
+    if len(scene.position) < 2:
         raise InputError("no two sensors see a target at a common time: bearings alone cannot place them")
-    lost = tuple(s for s in sensors if s not in position)
-    return Array(
-        first,
-        position,
-        rotation,
-        {k: p.time for k, p in paths.items()},
-        {k: p.place for k, p in paths.items()},
-        tuple(opened),
-        lost,
-    )
+    time, track = ({name: path[k] for name, path in scene.paths.items()} for k in (0, 1))
+    lost = tuple(s for s in sensors if s not in scene.position)
+    return Array(first, scene.position, scene.rotation, time, track, tuple(scene.opened), lost)
 
 
-def _targets(tracks: Mapping[tuple[str, str], DirectionTrack], sensor: str) -> list[str]:
-    return [target for s, target in tracks if s == sensor]
+class _Scene:
+    """Sensors and targets placed so far in the axes of the first sensor."""
 
+    def __init__(self, tracks: dict[tuple[str, str], _Path], sensors: list[str], first: str, level: bool):
+        d = next(iter(tracks.values())).place.shape[1]
+        self.tracks, self.sensors, self.first, self.level = tracks, sensors, first, level
+        self.targets = list(dict.fromkeys(k for _, k in tracks))
+        self.position, self.rotation = {first: np.zeros(d)}, {first: np.eye(d)}
+        self.paths, self.opened = dict[str, _Path](), list[str]()
 
-def _reach_targets(
-    tracks: Mapping[tuple[str, str], DirectionTrack],
-    position: dict[str, np.ndarray],
-    rotation: dict[str, np.ndarray],
-    paths: dict[str, _Path],
-) -> bool:
-    """Put targets into the frame whose scale two placed sensors tell, or the first one of all; whether any was."""
-    moved = False
-    if not paths:
-        (first,) = position
-        own = _targets(tracks, first)
-        if own:
-            best = max(own, key=lambda k: sum(k in _targets(tracks, s) for s in dict.fromkeys(s for s, _ in tracks)))
-            track = tracks[first, best]
-            paths[best] = _Path(track.time, track.place, track.spread)
-            moved = True
-    for target in dict.fromkeys(k for _, k in tracks):
-        seers = [s for s in position if (s, target) in tracks]
-        if target in paths or len(seers) < 2:
-            continue
-        a = max(seers, key=lambda s: len(tracks[s, target].time))
-        track, sizes, weights = tracks[a, target], [], []
+    def grown(self) -> bool:
+        """Place targets whose scale two placed sensors tell, then sensors that share one; whether any was placed."""
+        before = len(self.paths) + len(self.position)
+        if not self.paths:  # the first one of all
+            own = [k for k in self.targets if (self.first, k) in self.tracks]
+            best = max(own, key=lambda k: sum((s, k) in self.tracks for s in self.sensors))
+            self.paths[best] = self.tracks[self.first, best]
+        for target in self.targets:
+            if target not in self.paths:
+                self._place_target(target, [s for s in self.position if (s, target) in self.tracks])
+        for sensor in self.sensors:
+            if sensor not in self.position:
+                self._place_sensor(sensor)
+        return len(self.paths) + len(self.position) > before
+
+    def _place_target(self, target: str, seers: list[str]) -> None:
+        """Put a target where one sensor sees it, at the range that the others tell."""
+        if len(seers) < 2:
+            return
+        a = max(seers, key=lambda s: len(self.tracks[s, target].time))
+        track, sizes, weights = self.tracks[a, target], [], []
         for b in seers:
-            time = None if b == a else _common(track.time, tracks[b, target].time)
+            other = self.tracks[b, target]
+            time = None if b == a else track.common(other)
             if time is None:
                 continue
-            (A, CA), (B, CB) = _at(track, time), _at(tracks[b, target], time)
-            turn = rotation[a].T @ rotation[b]
-            found = similarity(B, A, CB, CA, rotation=turn)
-            apart = rotation[a].T @ (position[b] - position[a])
-            sizes.append(float(apart @ found.position) / max(float(found.position @ found.position), 1e-300))
-            weights.append(float(found.position @ found.position) / max(float(np.trace(found.spread)), 1e-300))
-        good = [k for k, size in enumerate(sizes) if size > 0]
-        if good:
-            scale = float(np.average([sizes[k] for k in good], weights=[weights[k] for k in good]))
-            place = position[a] + scale * track.place @ rotation[a].T
-            paths[target] = _Path(track.time, place, scale**2 * rotation[a] @ track.spread @ rotation[a].T)
-            moved = True
-    return moved
+            (A, CA), (B, CB) = track.at(time), other.at(time)
+            found = similarity(B, A, CB, CA, rotation=self.rotation[a].T @ self.rotation[b])
+            square = float(found.position @ found.position)
+            size = float((self.position[b] - self.position[a]) @ self.rotation[a] @ found.position)
+            if size > 0:
+                sizes.append(size / max(square, 1e-300))
+                weights.append(square / max(float(np.trace(found.spread)), 1e-300))
+        if sizes:
+            turn = float(np.average(sizes, weights=weights)) * self.rotation[a]
+            self.paths[target] = _Path(
+                track.time, self.position[a] + track.place @ turn.T, turn @ track.spread @ turn.T
+            )
 
+    def _place_sensor(self, sensor: str) -> None:
+        """Place a sensor that shares a target with those placed.
 
-def _reach_sensors(
-    tracks: Mapping[tuple[str, str], DirectionTrack],
-    position: dict[str, np.ndarray],
-    rotation: dict[str, np.ndarray],
-    paths: dict[str, _Path],
-    opened: list[str],
-    level: bool,
-) -> bool:
-    """Place the sensors that share a target with those placed; whether any was.
-
-    A target of which only the reference sensor knows the scale may serve too: its scale is found with the places.
-    """
-    moved = False
-    (first, *_) = position
-    for sensor in dict.fromkeys(s for s, _ in tracks):
-        if sensor in position:
-            continue
-        pairs, turns = [], []
-        for target in _targets(tracks, sensor):
-            own = tracks[sensor, target]
-            known = paths.get(target)
-            if known is None and (first, target) in tracks:  # its scale is open, its shape is not
-                other = tracks[first, target]
-                known = _Path(other.time, other.place, other.spread)
-            time = None if known is None else _common(known.time, own.time)
-            if known is None or time is None:
+        A target of which only the first sensor knows the scale tells of the turn.
+        """
+        turns, pairs = [], []
+        for target in self.targets:
+            own = self.tracks.get((sensor, target))
+            known = self.paths.get(target, self.tracks.get((self.first, target)))
+            time = None if own is None or known is None else known.common(own)
+            if own is None or known is None or time is None:
                 continue
-            (B, CB), (A, CA) = _at(own, time), known.at(time)
-            weight = 1.0 / np.maximum(np.trace(CB, axis1=1, axis2=2), 1e-300)
-            turns.append((B, A, weight))
-            if target in paths:
+            (B, CB), (A, CA) = own.at(time), known.at(time)
+            turns.append((B, A, 1.0 / np.maximum(np.trace(CB, axis1=1, axis2=2), 1e-300)))
+            if target in self.paths:
                 pairs.append((B, A, CB, CA))
         if not pairs:
-            continue
-        turn, sure = turn_of(turns, level)
-        found = [similarity(B, A, CB, CA, rotation=turn) for B, A, CB, CA in pairs]
+            return
+        turn, sure = turn_of(turns, self.level)
+        found = [similarity(*pair, rotation=turn) for pair in pairs]
         found = [f for f in found if f.scale > 0] or found
         information = [pseudo_inverse(f.spread, symmetric=True) for f in found]
         total = pseudo_inverse(sum(information), symmetric=True)
-        position[sensor] = total @ sum(J @ f.position for J, f in zip(information, found, strict=True))
-        rotation[sensor] = turn
-        if not sure:
-            opened.append(sensor)
-        moved = True
-    return moved
+        self.position[sensor] = total @ sum(J @ f.position for J, f in zip(information, found, strict=True))
+        self.rotation[sensor] = turn
+        self.opened += [sensor] * (not sure)

@@ -12,8 +12,10 @@ from probcal.linalg import nearest_rotation
 from probcal.modes.array import Array, DirectionTrack, match
 from probcal.modes.recognise import Directions, kinds, members, seen_directions
 from probcal.modes.reflections import node_places
-from probcal.modes.straight import StraightTrack, straight_track
+from probcal.modes.straight import StraightTrack, straight_track, wrapped
 from probcal.problem import Problem
+
+Turning = dict[str, tuple[int, float]]  # bias that turns the directions of a node, and its sign
 
 WIDE = 0.3  # rad, spread of a heading from which the grid alone is not trusted
 LOOSE = 0.2  # spread of a place, in extents of the network, from which triangulation is not
@@ -52,7 +54,7 @@ def _extent(problem: Problem) -> float:
     return float(np.linalg.norm(np.ptp(problem.node_positions, axis=0))) or 1.0
 
 
-def _turning(problem: Problem) -> dict[str, tuple[int, float]]:
+def _turning(problem: Problem) -> Turning:
     """Bias that turns the directions of each node, by its number, and the sign with which it adds to the heading."""
     own, known = members(problem), kinds(problem)
     found = {node: (part["heading"], 1.0) for node, part in own.items() if "heading" in part}
@@ -105,9 +107,7 @@ def turned(problem: Problem, point: Point) -> np.ndarray | None:
 # -- headings: crossings of lines of sight ---------------------------------------------------------------------------
 
 
-def _triangulated(
-    problem: Problem, seen: list[Directions], turning: dict[str, tuple[int, float]]
-) -> Iterator[np.ndarray]:
+def _triangulated(problem: Problem, seen: list[Directions], turning: Turning) -> Iterator[np.ndarray]:
     """Headings for which the lines of sight of all sensors cross, the places taken as stated (triangulation)."""
     place, turn = _stated(problem)
     names = list(dict.fromkeys(s.node for s in seen))
@@ -132,15 +132,15 @@ def _triangulated(
         yield z
 
 
-def _turn(problem: Problem, z: np.ndarray, turning: dict[str, tuple[int, float]], name: str, by: float) -> None:
+def _turn(problem: Problem, z: np.ndarray, turning: Turning, name: str, by: float) -> None:
     """Turn a node by an angle in rad, where a bias of it does."""
     if name in turning and np.isfinite(by):
         m, sign = turning[name]
         unit = np.pi / 180 if problem.biases[m].unit == "deg" else 1.0
-        z[m] = sign * ((by + np.pi) % (2 * np.pi) - np.pi) / unit / problem.scales[m]
+        z[m] = sign * wrapped(by) / unit / problem.scales[m]
 
 
-def _headings(problem: Problem, name: str, turn: dict[str, float], turning: dict[str, tuple[int, float]]) -> np.ndarray:
+def _headings(problem: Problem, name: str, turn: dict[str, float], turning: Turning) -> np.ndarray:
     """Headings of a node that are tried: around the stated one, as far as its spread goes."""
     spread = problem.scales[turning[name][0]] if name in turning else 0.0
     if spread == 0.0:
@@ -170,28 +170,23 @@ def _crossed(
     table: np.ndarray, places: np.ndarray, i: int, j: int, grids: list[np.ndarray]
 ) -> list[tuple[float, np.ndarray]]:
     """Losses and headings (sensors,) for the headings of two sensors on a grid, the best that lie apart first."""
-    A, B = np.meshgrid(grids[0], grids[1], indexing="ij")
-    a = A.ravel()[:, None] + table[:, i]
-    b = B.ravel()[:, None] + table[:, j]
-    base = places[j] - places[i]
-    sine = np.sin(b - a)
+    A, B = (own.ravel() for own in np.meshgrid(*grids, indexing="ij"))
+    sight_i, sight_j = (np.exp(1j * (own[:, None] + table[:, k])) for own, k in ((A, i), (B, j)))
+    place, sine = places @ [1.0, 1j], np.imag(sight_i.conj() * sight_j)
     sine = np.where(np.abs(sine) < 1e-3, 1e-3, sine)
-    ri = (base[0] * np.sin(b) - base[1] * np.cos(b)) / sine
-    rj = (base[0] * np.sin(a) - base[1] * np.cos(a)) / sine
-    crossing = places[i] + ri[..., None] * np.stack([np.cos(a), np.sin(a)], -1)  # (grid, rows, 2)
-    behind = (ri < 0) | (rj < 0)
-    loss = behind.mean(1)
-    headings = np.full((len(loss), len(places)), np.nan)
-    headings[:, i], headings[:, j] = A.ravel(), B.ravel()
-    for k in range(len(places)):
+    base = np.conj(place[j] - place[i])
+    reach = np.imag(base * sight_j) / sine
+    behind = (reach < 0) | (np.imag(base * sight_i) / sine < 0)
+    crossing, loss = place[i] + reach * sight_i, behind.mean(1)  # (grid, rows), (grid,)
+    headings = np.full((len(loss), len(place)), np.nan)
+    headings[:, i], headings[:, j] = A, B
+    for k in range(len(place)):
         there = np.isfinite(table[:, k])
-        if k in (i, j) or not there.any():
-            continue
-        line = crossing[:, there] - places[k]
-        turned = np.exp(1j * (np.arctan2(line[..., 1], line[..., 0]) - table[there, k])) * ~behind[:, there]
-        mean = turned.mean(1)
-        headings[:, k] = np.angle(mean)
-        loss = loss + (1 - np.abs(mean)) * there.sum() / len(there)
+        if k not in (i, j) and there.any():
+            off = np.angle(crossing[:, there] - place[k]) - table[there, k]
+            mean = (np.exp(1j * off) * ~behind[:, there]).mean(1)
+            headings[:, k] = np.angle(mean)
+            loss = loss + (1 - np.abs(mean)) * there.mean()
     order = np.argsort(loss, kind="stable")
     kept: list[tuple[float, np.ndarray]] = []
     for o in order:
@@ -206,7 +201,7 @@ def _crossed(
 # -- places too: similar triangles -----------------------------------------------------------------------------------
 
 
-def _matched(problem: Problem, seen: list[Directions], turning: dict[str, tuple[int, float]]) -> Iterator[np.ndarray]:
+def _matched(problem: Problem, seen: list[Directions], turning: Turning) -> Iterator[np.ndarray]:
     """Places and turns of the sensors by similar triangles, laid on what is stated of the network (DOA paper)."""
     level = problem.network.dimension == 3 and not any(
         {"pitch", "roll"} & set(part) for part in members(problem).values()
@@ -247,9 +242,8 @@ def _straight(seen: list[Directions]) -> Iterator[dict[str, StraightTrack]]:
             yield found
 
 
-def laid(problem: Problem, array: Array, turning: dict[str, tuple[int, float]] | None = None) -> Iterator[np.ndarray]:
+def laid(problem: Problem, array: Array, turning: Turning) -> Iterator[np.ndarray]:
     """Biases (M,) for which the network is the matched array, moved, turned and scaled onto what is stated of it."""
-    turning = _turning(problem) if turning is None else turning
     place, turn = _stated(problem)
     own, d, extent = members(problem), problem.network.dimension, _extent(problem)
     names, stated = list(array.position), {node.name: node for node in problem.network.nodes}
@@ -260,27 +254,26 @@ def laid(problem: Problem, array: Array, turning: dict[str, tuple[int, float]] |
     wh = 1.0 / (spread**2 + KNOWN**2)
     own_turn = np.array([np.arctan2(array.rotation[n][1, 0], array.rotation[n][0, 0]) for n in names])
     want = np.array([turn[n] for n in names]) - own_turn
-    best: tuple[float, np.ndarray, float, np.ndarray] | None = None
     w = wp / wp.sum()
     a, b = S - w @ S, P - w @ P
-    for Q in _turns(a, b, w, want, wh, d):
-        turned = b @ Q.T
-        scale = float(w @ (a * turned).sum(1)) / max(float(w @ (turned**2).sum(1)), 1e-300)
-        angle = np.arctan2(Q[1, 0], Q[0, 0])
-        off = (angle - want + np.pi) % (2 * np.pi) - np.pi
-        loss = float(wp @ ((a - scale * turned) ** 2).sum(1)) + float(wh @ off**2) if scale > 0 else np.inf
-        if best is None or loss < best[0]:
-            best = loss, Q, scale, w @ S - scale * (w @ P) @ Q.T
-    if best is None or not np.isfinite(best[0]):
+    Q = _turns(a, b, w, want, wh)
+    turned = b @ Q.mT
+    scale = np.sum(w @ (a * turned), 1) / np.maximum(np.sum(w @ turned**2, 1), 1e-300)
+    off = wrapped(np.arctan2(Q[:, 1, :1], Q[:, 0, :1]) - want)
+    loss = np.sum(wp @ (a - scale[:, None, None] * turned) ** 2, 1) + off**2 @ wh
+    loss = np.where(np.isfinite(loss) & (scale > 0), loss, np.inf)
+    best = int(loss.argmin())
+    if not np.isfinite(loss[best]):
         return
-    _, Q, scale, shift = best
+    similar = scale[best] * Q[best]
+    shift = w @ S - similar @ (w @ P)
     z = np.zeros(len(problem.labels))
     for n, p in zip(names, P, strict=True):
-        moved = shift + scale * Q @ p - place[n]
+        moved = shift + similar @ p - place[n]
         for k in range(d):
             if (m := own[n].get(f"position_{AXES[k]}")) is not None:
                 z[m] = moved[k] / problem.scales[m]
-        angles = attitude(Q @ array.rotation[n])
+        angles = attitude(Q[best] @ array.rotation[n])
         _turn(problem, z, turning, n, float(angles["heading"]) - turn[n])
         for name in ("pitch", "roll"):
             if name in own[n] and name in angles:
@@ -289,16 +282,12 @@ def laid(problem: Problem, array: Array, turning: dict[str, tuple[int, float]] |
     yield z
 
 
-def _turns(
-    a: np.ndarray, b: np.ndarray, w: np.ndarray, want: np.ndarray, wh: np.ndarray, d: int
-) -> Iterator[np.ndarray]:
-    """Turns (d, d) that are tried for the whole array: all around, by its places, and by its headings."""
-    angles = [*np.linspace(-np.pi, np.pi, 360, endpoint=False), float(np.angle(wh @ np.exp(1j * want))), *want]
+def _turns(a: np.ndarray, b: np.ndarray, w: np.ndarray, want: np.ndarray, wh: np.ndarray) -> np.ndarray:
+    """Turns (K, d, d) that are tried for the whole array: all around, by its headings, and by its places."""
     (ax, ay), (bx, by) = a[:, :2].T, b[:, :2].T
-    angles.append(float(np.arctan2(w @ (ay * bx - ax * by), w @ (ax * bx + ay * by))))
-    for angle in angles:
-        Q = np.eye(d)
-        Q[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-        yield Q
-    if d == 3:
-        yield nearest_rotation((a * w[:, None]).T @ b)[0]
+    own = np.arctan2(w @ (bx * ay - by * ax), w @ (bx * ax + by * ay))
+    angles = [*np.linspace(-np.pi, np.pi, 360, endpoint=False), np.angle(wh @ np.exp(1j * want)), *want, own]
+    Q = np.tile(np.eye(a.shape[1]), (len(angles), 1, 1))
+    c, s = np.cos(angles), np.sin(angles)
+    Q[:, :2, :2] = np.moveaxis(np.array([[c, -s], [s, c]]), 2, 0)
+    return np.concatenate([Q, nearest_rotation((a * w[:, None]).T @ b)[0][None]]) if len(Q[0]) == 3 else Q

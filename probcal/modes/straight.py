@@ -20,11 +20,6 @@ class StraightTrack(NamedTuple):
     cost: float
 
     @property
-    def velocity(self) -> np.ndarray:
-        """Velocity (T, d) at each time."""
-        return np.broadcast_to(self.state[len(self.state) // 2 :], (len(self.time), len(self.state) // 2))
-
-    @property
     def place(self) -> np.ndarray:
         """Places (T, d) relative to the sensor."""
         return (_along(self.time - self.time[0], len(self.state)) @ self.state[:, None])[..., 0]
