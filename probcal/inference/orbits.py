@@ -22,6 +22,7 @@ from probcal.inference.posed import Form, Posed, log_prior
 from probcal.linalg import least_squares
 from probcal.model.model import Recursion
 from probcal.model.trajectories import Trajectories
+from probcal.modes.reflections import place_biases
 from probcal.problem import Problem
 
 SIZES = (2.0, 0.5, 0.1)  # of a proposal, in sd along the direction by the frame: one of them by lot
@@ -136,15 +137,9 @@ def roam(form: Form, posed: Posed, at: Place, key: jax.Array) -> tuple[Place, ja
 def orbits_of(problem: Problem, posed: Posed, covariance: np.ndarray) -> tuple[Orbit, ...]:
     """The similarities that can be tried on a problem, for a covariance (M, M) of z by the frame."""
     d, point = problem.network.dimension, posed.frame.point
-    owners: dict[str, list[int]] = {}
-    headings = []
-    for m, bias in enumerate(problem.biases):
-        if bias.component == "position" and bias.since is None:
-            owners.setdefault(bias.owner, []).append(m)
-        elif bias.component == "heading" and bias.since is None:
-            headings.append(m)
-    by_name = {node.name: node for node in problem.network.nodes if node.path is None}
-    whole = {name: own for name, own in owners.items() if len(own) == d and name in by_name}
+    headings = [m for m, bias in enumerate(problem.biases) if bias.component == "heading" and bias.since is None]
+    by_name = {node.name: node for node in problem.network.nodes}
+    whole = {name: own for name, own in place_biases(problem).items() if len(own) == d}
     if not whole or any(form is not None for form in problem.model.sampled):
         return ()
     base: Any = np.stack([by_name[name].position for name in whole])
@@ -154,16 +149,12 @@ def orbits_of(problem: Problem, posed: Posed, covariance: np.ndarray) -> tuple[O
     )
     pinned: Any = tuple(linalg.pseudo_inverse(np.asarray(part.L)) for part in problem.model.recursions)
     places = tuple(tuple(own) for own in whole.values())
-    found: list[Orbit] = []
-    kinds: list[tuple[str, tuple[int, int], bool]] = [
-        ("turn", (a, b), False) for a in range(d) for b in range(a + 1, d)
+    driven, found = _levels(problem, spans), list[Orbit]()
+    kinds = [("turn", (a, b), ()) for a in range(d) for b in range(a + 1, d)] + [
+        ("shift", (a, a), ()) for a in range(d)
     ]
-    kinds += [("shift", (a, a), False) for a in range(d)] + [("size", (0, 0), False)]
-    driven = _levels(problem, spans)
-    kinds += [("size", (0, 0), True)] if driven else []
-    for kind, axes, free in kinds:
+    for kind, axes, levels in [*kinds, *(("size", (0, 0), own) for own in dict.fromkeys([(), driven]))]:
         turning = tuple(headings) if kind == "turn" and axes == (0, 1) else ()
-        levels = driven if free else ()
         volume = float(d * len(places) + _entries(problem, spans, levels)) if kind == "size" else 0.0
         arrays: Any = (base, problem.scales, base.mean(0), pinned, np.array(1.0))
         found.append(Orbit(kind, axes, places, turning, spans, levels, volume, *arrays))

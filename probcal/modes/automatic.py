@@ -1,5 +1,6 @@
 """The automatic start: the grid at what is stated, what families of sensors tell of wide biases, exchanged nodes."""
 
+import operator
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -7,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.gaussian.mode import Mode, Point, cost, find_mode
+from probcal.gaussian.mode import Point, cost, find_mode
 from probcal.model import variants
 from probcal.model.model import Model
 from probcal.modes.bearings import by_directions, turned
 from probcal.modes.grid import grid_start
-from probcal.modes.swaps import exchanged
+from probcal.modes.swaps import TRIED, exchanged, ranked, swaps
 from probcal.priors import Precision
 from probcal.problem import Problem, check_linear
 from probcal.types import float64
@@ -22,11 +23,14 @@ FAMILIES: tuple[Callable[[Problem], Iterator[np.ndarray]], ...] = (by_directions
 SAME = 1e-2  # nats within which two starts have come to one optimum
 NEAR = 15.0  # nats under a sparse prior within which another optimum is climbed too
 MOST = 3  # optima that are
+DRAWN = 3  # draws of the biases that are tried for one further start
+SPARSE = 0.3  # share of the biases that a draw moves
 
 
 class Optimum(NamedTuple):
     """A joint mode at the declared scales, its cost under a sparse prior, by which modes are ordered, if it settled."""
 
+    problem: Problem
     value: float
     point: Point
     settled: bool = True
@@ -51,50 +55,75 @@ def optima(problem: Problem, iterations: int = 30, stopped: Callable[[], bool] =
     check_linear(problem)
     measured = problem.at_measured()
     first = grid_start(problem, jax.device_put(problem.first_z), iterations)
-    found = [_polished(problem, first, iterations)]
-    if (z := turned(measured, first)) is not None:
-        found.append(_polished(problem, first._replace(z=jax.device_put(z)), iterations))
-    for family in FAMILIES:
-        for z in family(problem):
-            if stopped():
-                break
-            placed = grid_start(problem, jax.device_put(problem.first_z + z), iterations)
-            found.append(_polished(problem, placed, iterations))
-    best = min(found, key=_order)
-    for tracked in exchanged(measured, first, best.point, best.settled):
+    found = list[Optimum]()
+
+    def proposed() -> Iterator[tuple[Point, bool]]:
+        """Starts, and whether what they are polished to counts for them and does not take their place."""
+        yield first, False
+        if (z := turned(measured, first)) is not None:
+            yield first._replace(z=jax.device_put(z)), False
+        for family in FAMILIES:
+            for z in family(problem):
+                yield grid_start(problem, jax.device_put(problem.first_z + z), iterations), False
+        best = min(found, key=_value)
+        for tracked in exchanged(measured, first, best.point, best.settled):
+            yield tracked, True
+
+    for start, kept in proposed():
+        one = polished(problem, start, iterations)
+        if kept:
+            one = one._replace(value=min(sparse_cost(problem.model, start), one.value), point=start)
+        found.append(one)
         if stopped():
             break
-        value = min(float(sparse_cost(problem.model, tracked)), _polished(problem, tracked, iterations).value)
-        found.append(Optimum(value, tracked))
-    if len(found) == 1:
-        return found
-    kept: list[Optimum] = []
-    for one in sorted(found, key=_order):
-        if len(kept) < MOST and not any(abs(one.value - other.value) < SAME for other in kept):
-            kept.append(one)
-    return [one for one in kept if one is kept[0] or one.value < kept[0].value + NEAR]
+    chosen = list[Optimum]()
+    for one in sorted(found, key=_value):
+        if len(chosen) < MOST and not any(abs(one.value - other.value) < SAME for other in chosen):
+            chosen.append(one)
+    return [one for one in chosen if one is chosen[0] or one.value < chosen[0].value + NEAR]
 
 
-def _order(optimum: Optimum) -> float:
-    return optimum.value if np.isfinite(optimum.value) else np.inf
+def further_starts(problem: Problem, count: int, key: jax.Array) -> list[Point]:
+    """`count` other starts: of swapped pairs of nodes and of sparse draws of the biases, those that fit best.
+
+    A swap is the field's commonest gross error, and no local search finds it; draws move a share of the biases by
+    two scales. Each comes with the track that suits it; half of the starts are swaps where there are any.
+    """
+    if count < 1:
+        return []
+    seeds, pairs = jax.random.split(key, 3), [*swaps(problem).values()]
+    some = np.sort(np.asarray(jax.random.permutation(seeds[0], len(pairs)))[:TRIED])
+    shape = (DRAWN * count, len(problem.labels))
+    moved = np.asarray(jax.random.uniform(seeds[1], shape)) < SPARSE
+    drawn = np.where(moved, 2.0 * np.asarray(jax.random.normal(seeds[2], shape)), 0.0)
+    swapped, others = (
+        ranked(problem, [grid_start(problem, jax.device_put(problem.first_z + z), 30) for z in every])
+        for every in ([pairs[k] for k in some], drawn)
+    )
+    half = swapped[: (count + 1) // 2]
+    return [point for _, point in [*half, *others[: count - len(half)]]]
 
 
-def _polished(problem: Problem, tracked: Point, iterations: int) -> Optimum:
-    """The joint mode at the declared scales next to a point."""
-    mode = mode_from_start(problem.model, tracked, iterations)
-    return Optimum(float(sparse_cost(problem.model, mode.point)), mode.point, bool(mode.converged))
-
-
-def mode_from_start(model: Model, start: Point, iterations: int) -> Mode:
+def polished(problem: Problem, start: Point, iterations: int) -> Optimum:
     """The joint mode at the declared scales next to a start, by that with growing stds at the measured values."""
+    model = problem.model
     scales = Precision(jnp.ones(model.biases))
     if (measured := variants.at_measured(model)) is not model:
         start = find_mode(measured, start, scales, iterations, 1e-3).point
-    return find_mode(model, start, scales, iterations, 1e-3)
+    mode = find_mode(model, start, scales, iterations, 1e-3)
+    return Optimum(problem, sparse_cost(model, mode.point), mode.point, bool(mode.converged))
+
+
+def sparse_cost(model: Model, point: Point) -> float:
+    """Joint cost of a point with a Cauchy prior of scale one for each bias, infinite where there is none."""
+    found = float(_sparse_cost(model, point))
+    return found if np.isfinite(found) else np.inf
 
 
 @jax.jit
-def sparse_cost(model: Model, point: Point) -> jax.Array:
-    """Joint cost of a point with a Cauchy prior of scale one for each bias."""
+def _sparse_cost(model: Model, point: Point) -> jax.Array:
     flat = Precision(jnp.zeros(model.biases))
     return cost(model, point, flat) + jnp.sum(jnp.log1p(point.z**2))
+
+
+_value = operator.attrgetter("value")

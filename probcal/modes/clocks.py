@@ -1,7 +1,6 @@
 """First guess of the times of clocks: the lags at which the rows of each clock agree best with the others'."""
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +8,7 @@ import numpy as np
 from probcal.gaussian.choose import choose
 from probcal.gaussian.information import squares_of
 from probcal.gaussian.mode import Point
-from probcal.modes.automatic import mode_from_start, sparse_cost
+from probcal.modes.automatic import Optimum, polished
 from probcal.modes.grid import follow_states, grid_start
 from probcal.problem import Problem
 
@@ -21,14 +20,6 @@ GAIN = 3.0  # nats by which a lag must fit better
 EXPLAINED = 2.0  # mean square of the standardised residuals of a clock above which its lags are tried
 ROUNDS = 8  # of taking the rows where the mode puts them
 CLOSE = 0.01  # of its scale: change of a clock that ends them
-
-
-class _Tried(NamedTuple):
-    """A problem with its rows taken by some clocks, the joint mode near, and its cost."""
-
-    problem: Problem
-    point: Point
-    value: float
 
 
 def first_times(problem: Problem, stopped: Callable[[], bool] = lambda: False) -> Problem:
@@ -43,7 +34,7 @@ def first_times(problem: Problem, stopped: Callable[[], bool] = lambda: False) -
         return problem
     for rows, columns in _parts(problem):
         part = problem if rows.all() else problem.select(rows)
-        best = _polished(part, grid_start(part, jnp.asarray(part.first_z), 30), 30)
+        best = polished(part, grid_start(part, jnp.asarray(part.first_z), 30), 30)
         tried = set[int]()
         while (m := _worst(best, columns, tried)) is not None and not stopped():
             tried.add(m)
@@ -59,7 +50,7 @@ def first_times(problem: Problem, stopped: Callable[[], bool] = lambda: False) -
 def settled_times(problem: Problem, point: Point) -> tuple[Problem, Point]:
     """The problem with its rows taken where the joint mode near a point puts them, and that mode."""
     for _ in range(ROUNDS):
-        found = _polished(problem, point, 30)
+        found = polished(problem, point, 30)
         far = np.abs(problem.retimed(found.point.z).first_z - problem.first_z).max(initial=0.0)
         problem, point = taken_there(problem, found.point)
         if far < CLOSE:
@@ -88,20 +79,14 @@ def _parts(problem: Problem) -> Iterator[tuple[np.ndarray, list[int]]]:
         yield (away <= np.quantile(away, min(1.0, EPOCHS / count))), columns
 
 
-def _polished(problem: Problem, point: Point, steps: int) -> _Tried:
-    mode = mode_from_start(problem.model, point, steps)
-    value = float(sparse_cost(problem.model, mode.point))
-    return _Tried(problem, mode.point, value if np.isfinite(value) else np.inf)
-
-
-def _moved(best: _Tried, m: int, value: float) -> _Tried:
+def _moved(best: Optimum, m: int, value: float) -> Optimum:
     """The mode that a few steps reach with one bias of a clock moved, its rows taken there."""
-    found = _polished(*taken_there(best.problem, best.point._replace(z=best.point.z.at[m].set(value))), STEPS)
+    found = polished(*taken_there(best.problem, best.point._replace(z=best.point.z.at[m].set(value))), STEPS)
     problem, point = taken_there(found.problem, found.point)
     return found._replace(problem=problem, point=point)
 
 
-def _worst(best: _Tried, columns: list[int], tried: set[int]) -> int | None:
+def _worst(best: Optimum, columns: list[int], tried: set[int]) -> int | None:
     """The bias of the clock, of those not tried, whose rows are explained worst; None where all are explained."""
     problem, model, total = best.problem, best.problem.model, dict[str, list[float]]()
     for block, data, _, square, index in model.each_block(squares_of(model, best.point), problem.row_index):
@@ -117,7 +102,7 @@ def _worst(best: _Tried, columns: list[int], tried: set[int]) -> int | None:
     return max(left, key=lambda m: means[problem.biases[m].owner], default=None)
 
 
-def _lags(best: _Tried, m: int) -> np.ndarray:
+def _lags(best: Optimum, m: int) -> np.ndarray:
     """Values of bias m, in its scales, at which it is tried: lags within which the track hardly turns."""
     unit = np.zeros(len(best.problem.labels))
     unit[m] = 1.0

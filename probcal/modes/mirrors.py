@@ -63,32 +63,27 @@ def reflected_scenes(problem: Problem, point: Point, most: float = np.inf) -> It
     """
     z, free, counts = np.asarray(point.z), movable(problem), _counts(problem)
     targets = [n for epochs in problem.epochs for n in epochs.members if n in problem.targets]
-    every = sum(float(count.sum()) for count in counts)
     found = planes(problem, z)
     here = _losses(problem, z, point, None) if found else []
+    parts = [("the targets", free)] if len(targets) > 1 else []
+    for name in targets[:MOST]:
+        own = problem.model.each(lambda _, mine, own, n=name: mine & (own.target == n), free, problem.epochs)
+        parts.append((f'target "{name}"', own))
     seen: list[tuple[float, Candidate]] = []
     for plane in found:
         other = reflect_nodes(problem, z, plane)
-        ways = [(z, "")] if np.array_equal(other, z) else [(other, " and nodes"), (z, "")]
-        for biases, word in ways:
-            there = _losses(problem, biases, point, plane)
-            worse = [b - a for a, b in zip(here, there, strict=True)]
-            total = sum(float(w[mine].sum()) for w, mine in zip(worse, free, strict=True))
-            if any(mine.any() for mine in free) and total < WORSE * every:
-                who = "the targets" if len(targets) > 1 else f'target "{targets[0]}"'
-                whole = reflect(problem, point, plane, free, biases)
-                way = f"{who}{word} reflected in {plane.name}"
-                seen.append((total / every, Candidate(way, SCENE, whole)))
-            if len(targets) < 2 or word:
-                continue
-            for name in targets[:MOST]:
-                own = problem.model.each(lambda _, mine, own, n=name: mine & (own.target == n), free, problem.epochs)
-                much = sum(float(c[mine].sum()) for c, mine in zip(counts, own, strict=True))
-                loss = sum(float(w[mine].sum()) for w, mine in zip(worse, own, strict=True))
-                if any(mine.any() for mine in own) and loss < WORSE * much:
-                    alone = reflect(problem, point, plane, own, z)
-                    way = f'target "{name}" reflected in {plane.name}'
-                    seen.append((loss / much, Candidate(way, SCENE, alone)))
+        ways = [(z, parts)] if np.array_equal(other, z) else [(other, parts[:1]), (z, parts)]
+        for biases, moved in ways:
+            worse = list(map(np.subtract, _losses(problem, biases, point, plane), here))
+            word = "" if biases is z else " and nodes"
+            for who, own in moved:
+                loss, much = (
+                    sum(float(part[mine].sum()) for part, mine in zip(values, own, strict=True))
+                    for values in (worse, counts)
+                )
+                if loss < WORSE * much:
+                    way = f"{who}{word} reflected in {plane.name}"
+                    seen.append((loss / much, Candidate(way, SCENE, reflect(problem, point, plane, own, biases))))
     yield from (candidate for _, candidate in sorted(seen, key=lambda one: one[0]))
 
 

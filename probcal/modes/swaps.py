@@ -1,7 +1,8 @@
 """Exchanged nodes: the commonest gross error of a survey, which no local search undoes."""
 
 import itertools
-from collections.abc import Iterator
+import operator
+from collections.abc import Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -61,23 +62,25 @@ def exchanged(problem: Problem, tracked: Point, point: Point, settled: bool) -> 
     if not far or (settled and max(far.values()) < GROSS):
         return
     order = sorted(swaps(problem), key=lambda pair: -max(far[pair[0]], far[pair[1]]))[:TRIED]
-    flat = Precision(jnp.zeros(len(problem.labels)))
-
-    def fitted(start: Point) -> float:
-        value = float(joint_cost(problem.model, track_mode(problem, start, SCREENED), flat))
-        return value if np.isfinite(value) else np.inf
-
-    best, starts = fitted(tracked), [tracked]
+    best, starts = ranked(problem, [track_mode(problem, tracked, SCREENED)])[0][0], [tracked]
     for _ in range(ROUNDS):
-        tried: dict[bytes, tuple[float, np.ndarray]] = {}
-        for start in starts:
-            for pair, exchange in swaps(problem, np.asarray(start.z)).items():
-                if pair in order and (name := exchange.round(6).tobytes()) not in tried:
-                    tried[name] = fitted(start._replace(z=jax.device_put(exchange))), exchange
-        kept = sorted(tried.values(), key=lambda one: one[0])[:KEPT]
-        better = [exchange for value, exchange in kept if value < best - GAIN]
+        tried = {
+            exchange.round(6).tobytes(): start._replace(z=jax.device_put(exchange))
+            for start in starts
+            for pair, exchange in swaps(problem, np.asarray(start.z)).items()
+            if pair in order
+        }
+        kept = ranked(problem, [track_mode(problem, start, SCREENED) for start in tried.values()])[:KEPT]
+        better = [point.z for value, point in kept if value < best - GAIN]
         if not better:
             return
         best = kept[0][0]
-        starts = [grid_start(problem, jax.device_put(exchange), 30) for exchange in better]
+        starts = [grid_start(problem, z, 30) for z in better]
         yield from starts
+
+
+def ranked(problem: Problem, points: Sequence[Point]) -> list[tuple[float, Point]]:
+    """Points and their joint costs under a flat prior, those first that fit best."""
+    flat = Precision(jnp.zeros(len(problem.labels)))
+    costs = np.nan_to_num([float(joint_cost(problem.model, point, flat)) for point in points], nan=np.inf)
+    return sorted(zip(costs.tolist(), points, strict=True), key=operator.itemgetter(0))
