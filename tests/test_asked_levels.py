@@ -13,6 +13,7 @@ import probcal
 from probcal import MAP, Bias, Channel, ConstantVelocity, Network, Node, Problem, Target, simulate
 from probcal.analysis import levels, pieces
 from probcal.analysis.assess import assess
+from probcal.gaussian.engine import noise_score
 from probcal.inference.fit import calibrate
 from probcal.inference.fitted import take_up
 from probcal.noise import Unknown
@@ -26,7 +27,7 @@ TIME = np.arange(0.0, 40.0, 0.5)
 START = {"position": ((0.0, 0.0), 5.0), "velocity": ((1.0, 0.5), 1.0)}
 PLACES = {"a": (0.0, 0.0), "b": (10.0, 5.0), "c": (-5.0, 8.0)}
 take_up = float64(take_up)
-members_of, ask, slopes = (float64(one) for one in (levels.members_of, levels.ask, levels.slopes))
+members_of, ask, score = (float64(one) for one in (levels.members_of, levels.ask, noise_score))
 TRUE = {"a.shift": 1.0, "a.tilt": 0.0, "b.shift": -0.5, "b.tilt": 0.4, "c.shift": 0.0, "c.tilt": 0.0}
 
 
@@ -66,7 +67,7 @@ def test_slope_and_curvature_are_those_of_the_evidence():
     members = members_of(problem)
     assert [level.label for level in members.levels] == ["fixer.place_std", "fixer.rate_std", "motion.velocity_std"]
     assert [(index == 0).sum() for index in members.rows] == [2 * problem.measurements.measured[:, 0].sum()]
-    found = slopes(fit.expansion, fit.factors, members)
+    found = members.sums(*score(fit.expansion, fit.factors))
     asked = ask(fit, members, fit.factors)
     step, names = 0.005, {"place": 0.5, "rate": 0.2, "motion": 0.4}
     middle = evidence()
@@ -74,7 +75,7 @@ def test_slope_and_curvature_are_those_of_the_evidence():
         name: [evidence(**{name: value * np.exp(side * step)}) for side in (1, -1)] for name, value in names.items()
     }
     slope = [(up - down) / (2 * step) for up, down in sides.values()]
-    np.testing.assert_allclose(found.level, slope, atol=0.05)
+    np.testing.assert_allclose(found, slope, atol=0.05)
     curvature = [-(up + down - 2 * middle) / step**2 for up, down in sides.values()]
     precision = np.diag(np.linalg.inv(np.diag(asked.sd) @ np.diag(asked.sd)))
     np.testing.assert_allclose(precision, curvature, rtol=0.06)

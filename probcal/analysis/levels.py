@@ -72,13 +72,6 @@ class Members(NamedTuple):
         return Members(levels, [place[k] for k in self.rows], [place[k] for k in self.noises])
 
 
-class Slopes(NamedTuple):
-    """Slopes of the log evidence at a point: by log levels, and by z before the prior."""
-
-    level: np.ndarray  # (K,)
-    z: np.ndarray  # (M,)
-
-
 class Wanted(NamedTuple):
     """What the data ask for: where the evidence is largest by its expansion, and what would move with it."""
 
@@ -140,11 +133,6 @@ def _with_unknown(problem: Problem, number: np.ndarray, index: np.ndarray, found
     return index
 
 
-def slopes(at: Expansion, factors: Factors, members: Members) -> Slopes:
-    """Slopes of the log evidence at a point with trajectories at their mode, under the factors of a prior."""
-    return Slopes(members.sums(*noise_score(at, factors)), np.asarray(at.score()))
-
-
 def _at(engine: Engine, at: Expansion, members: Members, step: np.ndarray, z: np.ndarray) -> Expansion:
     """The posterior with the levels a step (K,) of their logs away, trajectories at their mode, biases moved by z."""
     factor = np.append(np.exp(step), 1.0)  # what has no level goes last
@@ -170,33 +158,32 @@ def _expanded(
     The posterior there; slope (K,) and inverse negative curvature (K, K) by log levels, how much these pull the score
     of z (K, M) and move its mode (K, M), None without a maximum.
     """
-    K, engine = len(members.levels), fit.engine
-    here = slopes(at, factors, members)
+    K, M = len(members.levels), len(at.point.z)
+
+    def stepped(step: np.ndarray, away: np.ndarray) -> Expansion:
+        return _at(fit.engine, at, members, step, away)
+
+    def slopes(at: Expansion) -> np.ndarray:
+        """Slopes (K + M,) of the log evidence by log levels, and by z before the prior."""
+        return np.append(members.sums(*noise_score(at, factors)), at.score())
+
+    here = slopes(at)
     for _ in range(CLIMBS):
-        away = np.asarray(at.solve(factors, here.z + factors.pull(at.point.z)))
+        away = np.asarray(at.solve(factors, here[K:] + factors.pull(at.point.z)))
         if not np.abs(away).max(initial=0.0) > SETTLED_Z:
             break
-        at = _at(engine, at, members, np.zeros(K), away)
-        here = slopes(at, factors, members)
-    still, beside = np.zeros(len(at.point.z)), list[tuple[Slopes, Slopes]]()
-    for unit in np.eye(K):
-        up, down = (slopes(_at(engine, at, members, s * unit, still), factors, members) for s in (STEP, -STEP))
-        beside.append((up, down))
-    pull = np.array([(up.z - down.z) / (2 * STEP) for up, down in beside])  # (K, M)
-    curved = -np.array([(up.level - down.level) / (2 * STEP) for up, down in beside])
+        at = stepped(np.zeros(K), away)
+        here = slopes(at)
+    pairs = [[slopes(stepped(s * unit, np.zeros(M))) for s in (STEP, -STEP)] for unit in np.eye(K)]
+    curved, pull = np.split(np.array([up - down for up, down in pairs]) / (2 * STEP), [K], axis=1)
     follow = np.asarray(at.solve(factors, pull.T)).T
-    matrix, slope = 0.5 * (curved + curved.T) - pull @ follow.T, here.level
-    unknown = np.array([level.unknown for level in members.levels])
-    own = np.flatnonzero(unknown >= 0)
-    spread = np.asarray(fit.problem.model.level_spread)[unknown[own]]
-    known = np.zeros(K)
-    known[own] = 1.0 / spread**2
-    slope = slope - known * moved
-    slope[own] -= np.asarray(fit.point.levels)[unknown[own]] / spread**2
-    alone = np.diag(curved) + known
+    unknown = [level.unknown for level in members.levels]
+    known = np.append(fit.problem.model.level_spread, np.inf)[unknown] ** -2
+    slope = here[:K] - np.append(fit.point.levels, 0.0)[unknown] * known
+    alone = known - np.diag(curved)
+    matrix = np.diag(known) - 0.5 * (curved + curved.T) - pull @ follow.T
     if not (np.isfinite(matrix).all() and np.isfinite(slope).all() and (alone > 0).all()):
         return at, None
-    matrix = matrix + np.diag(known)
     if not eigenvalues(matrix).min() > 0:  # far from the maximum: each level by itself
         matrix = np.diag(alone)
     return at, (slope, invert(matrix), pull, follow)

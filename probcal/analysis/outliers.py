@@ -6,7 +6,6 @@ from scipy import special
 from probcal.analysis.check import Case, Checked, check
 from probcal.analysis.findings import NAMES, Finding
 from probcal.analysis.verdict import RATE
-from probcal.inference.residuals import codes
 from probcal.labels import listed
 from probcal.noise import Normal
 
@@ -24,12 +23,11 @@ def check_outliers(case: Case) -> Checked:
     several data of one target say at one time: it has turned.
     """
     fit, found = case.fit, case.innovations
-    group, labels = codes(fit.data, ["sensor", "channel"])
+    channels = case.channels
     kinds = {s.name: dict(s.type.expand(fit.problem.network.dimension)) for s in fit.problem.network.sensors}
     target, time = fit.data["target"].to_numpy(str), fit.data["time"].to_numpy()
-    members = np.split(np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))[:-1])
     off, chosen = np.zeros(len(target), bool), list[tuple[str, np.ndarray]]()
-    for (sensor, channel), mine in zip(labels.itertuples(index=False), members, strict=True):
+    for (sensor, channel), mine in zip(channels.labels.itertuples(index=False), channels.members, strict=True):
         if isinstance(kinds[sensor][channel].noise, Normal):
             order = mine[np.lexsort((time[mine], target[mine]))]
             size = np.abs(found.value[order])
@@ -43,7 +41,7 @@ def check_outliers(case: Case) -> Checked:
         again = out[1:] & out[:-1] & (np.sign(value[1:]) == np.sign(value[:-1])) & (owner[1:] == owner[:-1])
         count = int(out.sum())
         chance = special.bdtrc(count - 1, len(order), 2 * special.ndtr(-OUTLYING)) if count else 1.0
-        if count > 1 and chance < RATE / len(labels) and again.sum() < TOGETHER * count:
+        if count > 1 and chance < RATE / len(channels.members) and again.sum() < TOGETHER * count:
             counts[name] = f"{count} of {len(order)}"
     if not counts:
         return Checked()
