@@ -16,10 +16,11 @@ from probcal.identifiability.watch import runs, strained_starts
 from probcal.inference.progress import Monitor
 from probcal.inference.widen import judge_fit
 from probcal.labels import NODE, START, listed
-from probcal.modes.explore import SAME, Mirrored
+from probcal.modes.explore import SAME
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.results.build import build
+from probcal.results.build import build, modes_of
+from probcal.results.modes import AGAIN, REJECTED, apart
 from probcal.results.schema import DIFFERENT
 
 if TYPE_CHECKING:
@@ -118,17 +119,14 @@ def _watched(answer: Answer) -> Answer:
         found = found.judged(**{"gauge" if run.gauge else "along": run})
     for strained in strained_starts(problem, point) if answer.motion == "used" else ():
         found = found.judged(strained=strained)
-    for other in answer.mirrors:
-        near = "worse" if other.gain <= -SAME else "equal"
-        found = found.judged(**{near: (abs(other.gain), _place(answer, other))})
-    alike = {other.kind for other in answer.mirrors if other.gain > -SAME}
+    reported, *others = modes_of(answer)[0]
+    others = [other for other in others if other.kind not in (AGAIN, REJECTED)]
+    sd = answer.posterior.here[1] * problem.scales
+    for other in others:
+        away = apart(other.bias, reported.bias, sd)
+        labels = [problem.labels[m] for m in np.argsort(-away) if away[m] > DIFFERENT]
+        place = f"{other.name}, " + (f"with other {listed(labels, NAMED)}" if labels else "the biases alike")
+        found = found.judged(**{"worse" if other.gain <= -SAME else "equal": (abs(other.gain), place)})
+    alike = {other.kind for other in others if other.gain > -SAME}
     side = "line" if problem.network.dimension == 2 else "plane"
     return found.judged(node=NODE in alike, side=side if alike - {NODE, START} else "")
-
-
-def _place(answer: Answer, other: Mirrored) -> str:
-    """The place of an answer on the other side of a mirror, and the biases that differ there."""
-    problem = answer.problem
-    away = np.abs(other.shift) / np.maximum(answer.posterior.here[1], 1e-12)
-    labels = [problem.labels[m] for m in np.argsort(-away) if away[m] > DIFFERENT]
-    return f"{other.name}, " + (f"with other {listed(labels, NAMED)}" if labels else "the biases alike")

@@ -15,7 +15,7 @@ from probcal.inference.method import Context, Method
 from probcal.inference.methods import MAP
 from probcal.inference.progress import Monitor, Stopped
 from probcal.inference.run import Maximiser
-from probcal.labels import START, listed
+from probcal.labels import listed
 from probcal.modes import further_starts
 from probcal.modes import optima as optima_of
 from probcal.modes.clocks import first_times, settled_times, taken_there
@@ -25,8 +25,6 @@ from probcal.modes.mirrors import other_sides
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.results.modes import ELSEWHERE, LEAST
-from probcal.results.schema import DIFFERENT
 from probcal.wings import of_wing
 
 ROUNDS = 8  # answers in turn, each with the rows where the one before puts them
@@ -113,10 +111,9 @@ def solve_timed(
     if not method.climbs or found.motion != "used":
         return found
     try:
-        beside = _beside_mirrors(found, cast("Maximiser", found.method), context)
+        return _beside_mirrors(found, cast("Maximiser", found.method), context)
     except MemoryError:
         return found.noted("Memory did not hold what looking at the other side of a mirror takes.")
-    return replace(beside, mirrors=(*beside.mirrors, *_beside_optima(beside, (found, *found.optima))))
 
 
 def each_start[T](places: Sequence[T], method: Method, monitor: Monitor) -> Iterator[tuple[int, T]]:
@@ -268,24 +265,6 @@ def _weight(answer: Answer) -> float:
     if estimates(getattr(answer.method, "engine", "dense")) and answer.trace is not None:
         return float(answer.trace[-1])
     return answer.objective
-
-
-def _beside_optima(answer: Answer, others: Sequence[Answer]) -> tuple[Mirrored, ...]:
-    """Answers from other starts whose evidence is near that of the answer, each once, as answers beside it."""
-    if not (answer.status.valid and answer.posterior.sound):
-        return ()
-    mean, sd = answer.posterior.here
-    known = [mean, *(mean + other.shift for other in answer.mirrors)]
-    found = []
-    for other in sorted(others, key=lambda one: -one.objective):
-        gain = other.objective - answer.objective
-        if not (other.status.valid and other.posterior.sound and gain > -NEAR):
-            continue
-        there = other.posterior.here[0]
-        if all(np.max(np.abs(there - one) / np.maximum(sd, LEAST), initial=0.0) > DIFFERENT for one in known):
-            found.append(Mirrored(ELSEWHERE, gain, other.posterior.point, there - mean, START))
-            known.append(there)
-    return tuple(found)
 
 
 def _suited(given: Problem, problem: Problem, start: Point) -> Point:
