@@ -8,6 +8,7 @@ a random angle, shift or factor, -r as likely as r, and accepted by the joint de
 
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 from typing import Any
 
 import jax
@@ -150,9 +151,7 @@ def orbits_of(problem: Problem, posed: Posed, covariance: np.ndarray) -> tuple[O
     pinned: Any = tuple(linalg.pseudo_inverse(np.asarray(part.L)) for part in problem.model.recursions)
     places = tuple(tuple(own) for own in whole.values())
     driven, found = _levels(problem, spans), list[Orbit]()
-    kinds = [("turn", (a, b), ()) for a in range(d) for b in range(a + 1, d)] + [
-        ("shift", (a, a), ()) for a in range(d)
-    ]
+    kinds = [("turn", pair, ()) for pair in combinations(range(d), 2)] + [("shift", (a, a), ()) for a in range(d)]
     for kind, axes, levels in [*kinds, *(("size", (0, 0), own) for own in dict.fromkeys([(), driven]))]:
         turning = tuple(headings) if kind == "turn" and axes == (0, 1) else ()
         volume = float(d * len(places) + _entries(problem, spans, levels)) if kind == "size" else 0.0
