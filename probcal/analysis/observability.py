@@ -21,7 +21,6 @@ from probcal.linalg import eigenvalues, marginalise
 from probcal.problem import Problem
 from probcal.results.answer import Tracks
 from probcal.results.blocks import SensorBlocks
-from probcal.results.build import bands
 from probcal.results.groups import along, bias_coords, constant_group, datum_of, direction_group, gather, track_groups
 from probcal.simulate import Truth
 from probcal.types import float64
@@ -72,7 +71,7 @@ def observability(problem: Problem, *, point: Point | None = None, truth: Truth 
     groups = {
         "bias": _biases(problem, share, np.sqrt(blocks.variance), information),
         **_leverage_groups(problem, leverages, share),
-        **track_groups(problem, bands(tracked, point)),
+        **track_groups(problem, tracked, point.states),
         "constant_data": constant_group(problem),
     }
     if information is None:

@@ -19,7 +19,7 @@ from probcal.modes import automatic_start
 from probcal.modes.grid import grid_start
 from probcal.problem import Problem, check_linear
 from probcal.results.answer import tracks_of
-from probcal.results.build import bands, build_tracks
+from probcal.results.build import build_tracks
 from probcal.results.read import apply
 from probcal.simulate import Key, as_key
 from probcal.types import float64
@@ -67,5 +67,5 @@ def track(
         _, before = settle(engine, problem, before, np.zeros((len(z), 0)))
         problem, after = settle(engine, problem, after, found.spread.root())
     at = engine.settled(problem.model, after)
-    tree = build_tracks(problem, bands(tracks_of(at, found.spread), before))
+    tree = build_tracks(problem, tracks_of(at, found.spread), before.states)
     return judge_tracks(tree, problem, found, engine, at)

@@ -49,7 +49,6 @@ from probcal.results.answer import (
 )
 from probcal.results.blocks import SensorBlocks
 from probcal.results.build import build_tracks
-from probcal.results.groups import Band
 from probcal.status import CLIMB, Status, judge
 
 if TYPE_CHECKING:
@@ -379,7 +378,7 @@ def track_by_particles(
     drawn = np.asarray(draw_biases(point, jnp.asarray(covariance), keys[2], SPREAD)) if len(z) else np.zeros((1, 0))
     tracks = paths.over(drawn, levels, keys[3]).tracks
     seen = problem.seen()
-    tree = build_tracks(seen, [Band(t.mean, t.sd, np.asarray(m.mean)) for t, m in zip(tracks, zero, strict=True)])
+    tree = build_tracks(seen, tracks, [np.asarray(own.mean) for own in zero])
     status, message = status_of_tracks(seen, point, found)
     tree.attrs |= {"status": str(status), "message": message, "smoother": repr(how)}
     return tree

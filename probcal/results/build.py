@@ -19,7 +19,6 @@ from probcal.modes.explore import NEAR, SAME
 from probcal.results.accessor import register
 from probcal.results.answer import Answer, Draws, Summary, Tracks
 from probcal.results.groups import (
-    Band,
     along,
     bias_coords,
     by_target,
@@ -51,14 +50,16 @@ def build(answer: Answer, directions: Sequence[Any], key: jax.Array, keep: tuple
     problem, posterior = answer.problem, answer.posterior
     draws = posterior.draws(key, keep)
     before = posterior.before
-    tracks = bands(posterior.tracks(), before)
+    tracks, zero = posterior.tracks(), [np.asarray(states) for states in before.states]
     large = many_data(problem.model)  # no log-likelihood by datum, and nothing finer than noise or sd tell
-    tracks = [_coarse(own) for own in tracks] if large else tracks
+    if large:
+        zero = [_stepped(states, own.sd, COARSE) for states, own in zip(zero, tracks, strict=True)]
+        tracks = [Tracks(*(_stepped(values, own.sd, COARSE) for values in own)) for own in tracks]
     groups = {
         "posterior": _posterior_group(answer, draws),
         "calibration": _calibration_group(answer),
         **_mode_groups(answer),
-        **track_groups(problem, tracks, draws.states, _sample(draws) if len(draws.states) else None),
+        **track_groups(problem, tracks, zero, draws.states, _sample(draws) if len(draws.states) else None),
         "constant_data": constant_group(problem, posterior.point),
         **_data_groups(answer, draws, before, large),
     }
@@ -100,11 +101,6 @@ def _sample(draws: Draws) -> dict[str, Any]:
     return {"chain": np.arange(chains), "draw": np.arange(count)}
 
 
-def bands(tracks: Sequence[Tracks], before: Point) -> list[Band]:
-    """Tracks with their means without calibration."""
-    return [Band(own.mean, own.sd, np.asarray(before.states[r])) for r, own in enumerate(tracks)]
-
-
 def _posterior_group(answer: Answer, draws: Draws) -> xr.Dataset:
     """Draws of the biases, and of what else varies with them."""
     problem = answer.problem
@@ -140,11 +136,6 @@ def _calibration_group(answer: Answer) -> xr.Dataset:
     values |= along(("bias_label", "bias_label_other"), matrices)
     coords = bias_coords(problem) | ({"bias_label_other": labels} if matrices else {})
     return xr.Dataset(values, coords=coords)
-
-
-def _coarse(band: Band) -> Band:
-    """Tracks to a small part of their sd: what is finer says nothing, and does not compress."""
-    return Band(*(_stepped(values, band.sd, COARSE) for values in (band.mean, band.sd, band.before)))
 
 
 def _data_groups(answer: Answer, draws: Draws, before: Point, large: bool) -> dict[str, xr.Dataset]:
@@ -218,10 +209,10 @@ def _stepped(values: np.ndarray, spread: np.ndarray, steps: int) -> np.ndarray:
     return np.where(sure, np.rint(values / step) * step, values)
 
 
-def build_tracks(problem: Problem, tracks: Sequence[Band]) -> xr.DataTree:
+def build_tracks(problem: Problem, tracks: Sequence[Tracks], before: Sequence[Any]) -> xr.DataTree:
     """A tree of tracks alone, for data to which a calibration was applied."""
     register()
-    tree = xr.DataTree.from_dict(track_groups(problem, tracks))
+    tree = xr.DataTree.from_dict(track_groups(problem, tracks, before))
     tree.attrs["data"] = problem.measurements.table.source
     tree.attrs.update(_epoch(problem))
     return tree

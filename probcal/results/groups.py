@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -17,14 +17,7 @@ from probcal.results.views import view_variables
 if TYPE_CHECKING:
     from probcal.gaussian.mode import Point
     from probcal.problem import Problem
-
-
-class Band(NamedTuple):
-    """Mean and sd of the states of one recursion, and their mean without calibration, (E, n) each."""
-
-    mean: np.ndarray
-    sd: np.ndarray
-    before: np.ndarray
+    from probcal.results.answer import Tracks
 
 
 def bias_coords(problem: Problem, chosen: Any = None) -> dict[str, Any]:
@@ -89,11 +82,16 @@ def direction_group(labels: Sequence[str], directions: Sequence[Any]) -> xr.Data
 
 
 def track_groups(
-    problem: Problem, tracks: Sequence[Band], states: Sequence[np.ndarray] = (), chains: Mapping[str, Any] | None = None
+    problem: Problem,
+    tracks: Sequence[Tracks],
+    before: Sequence[Any],
+    states: Sequence[np.ndarray] = (),
+    chains: Mapping[str, Any] | None = None,
 ) -> dict[str, xr.Dataset]:
     """Mean, sd and uncalibrated mean of every state, a group `track/<target>` each; draws of the states if given."""
     columns: dict[str, tuple[tuple[str, ...], Sequence[Any]]] = {
-        name: (("time", "component"), [getattr(t, name) for t in tracks]) for name in ("mean", "sd", "before")
+        name: (("time", "component"), own)
+        for name, own in {"mean": [t.mean for t in tracks], "sd": [t.sd for t in tracks], "before": before}.items()
     }
     if len(states):
         columns["state"] = (("chain", "draw", "time", "component"), states)
