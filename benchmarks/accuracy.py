@@ -100,7 +100,7 @@ def plain(problem: pc.Problem, truth: pc.Truth, case: Case) -> Score:
         raise RefusedError("its detections name no target")
     begun = time.perf_counter()
     with jax.enable_x64(True):
-        point = grid_start(problem, jax.device_put(np.zeros(problem.model.biases)), 100)
+        point = grid_start(problem, np.zeros(problem.model.biases), 100)
     took = time.perf_counter() - begun
     known, true = surveyed(problem, truth)
     bias = float(np.sqrt(np.mean(true**2))) if len(known) else None

@@ -54,7 +54,7 @@ def one_model(name, data):
         cold = time.perf_counter() - begun
         automatic = [reached(one.point) for one in found]
         rng = np.random.default_rng(0)
-        drawn = [reached(grid_start(problem, jnp.asarray(rng.standard_normal(problem.model.biases)), 30))
+        drawn = [reached(grid_start(problem, rng.standard_normal(problem.model.biases)))
                  for _ in range(RANDOM)]  # fmt: skip
     best = np.nanmin([*automatic, *drawn])
     share = np.mean([cost < best + SAME for cost in drawn])

@@ -31,7 +31,6 @@ RULE = (
 )
 
 NOT_FINITE = "observability: the rows have no finite derivatives at the start; is a target at the place of a sensor?"
-NAMED = 20  # combinations of single sensors that are named where biases are many
 SCREENED = (
     "of so many biases rigid motions, common shifts and the combinations of each sensor were looked at; no spectrum"
 )
@@ -75,7 +74,7 @@ def observability(problem: Problem, *, point: Point | None = None, truth: Truth 
         "constant_data": constant_group(problem),
     }
     if information is None:
-        directions, weak = screened_directions(problem, at, blocks, NAMED)
+        directions, weak = screened_directions(problem, at, blocks)
         gauges = sum(own.kind == "gauge" for own in directions)
         least, countable = min((own.information for own in directions), default=WEAK), True
     else:

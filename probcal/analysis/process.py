@@ -12,12 +12,12 @@ import numpy as np
 from probcal.analysis.check import Case, Checked, check
 from probcal.analysis.findings import Finding
 from probcal.gaussian.draws import simulated
+from probcal.inference.residuals import LAGS
 from probcal.motion.base import GAUSSIAN, Component, level_name
 from probcal.noise import Normal, guess_of
 
 REPLICAS, MOST = 200, 2e7  # drawn, and entries of all of them together
 FEWEST = 30  # epochs, and replicas, below which nothing is said
-LAGS = 10
 LIMIT = 4.5  # sd of the replicas
 HEAVIER, TOGETHER = 1.3, 0.2  # times the kurtosis, and correlation, from which it matters
 HELD = 0.05  # sd of a smoothed noise, 1 before the data, below which these say nothing of it

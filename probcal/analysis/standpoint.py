@@ -16,8 +16,6 @@ from probcal.problem import Problem, check_linear
 from probcal.simulate import Truth, on_tracks
 from probcal.types import float64
 
-START_STEPS = 30  # of a track of a network that is large
-
 
 def check_free(problem: Problem) -> None:
     """Raise `InputError` for a problem without free biases, or of a motion without linear form."""
@@ -31,7 +29,7 @@ def standpoint(problem: Problem, point: Point | None, truth: Truth | None) -> Po
     """The point where a problem is looked at: a given one, that of a truth, else the automatic start."""
     if point is not None or truth is None:
         if point is None and not choose(problem.model).cheap:
-            return grid_start(problem, jnp.asarray(problem.first_z), START_STEPS)
+            return grid_start(problem)
         return automatic_start(problem) if point is None else point
     z, states = true_point(problem, truth)
     one = tuple(x[0] for x in states)

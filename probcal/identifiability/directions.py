@@ -24,6 +24,7 @@ ALONG = 0.1  # share of the largest entry above which a component moves along wi
 APART = 0.5  # part of a unit direction outside those already named that makes it a new one
 MATCH = 1e-3  # how closely a gauge must follow a pattern
 INSIDE = {"gauge": 1e-6, "weak": 0.3}  # size outside one sensor below which a unit direction is its own
+ALONE = 20  # combinations of the biases of single sensors that are named where biases are many
 MOSTLY = 0.7  # size inside the weak space from which a completed pattern belongs to it
 
 
@@ -173,18 +174,16 @@ def combination(problem: Problem, labels: list[str], vector: np.ndarray, why: st
     return Pattern(name, f"{amounts} together hardly change the data{why}", vector, "", alone)
 
 
-def screened_directions(
-    problem: Problem, at: Expansion, blocks: SensorBlocks, most: int
-) -> tuple[tuple[Direction, ...], int]:
+def screened_directions(problem: Problem, at: Expansion, blocks: SensorBlocks) -> tuple[tuple[Direction, ...], int]:
     """Directions that the data leave to the prior where biases are too many for a matrix of all, and their number.
 
-    Looked at are rigid motions and common shifts, and combinations of the biases of each sensor, at most `most` of them
-    named, the weakest first. `blocks` is what a prior of the declared scales leaves of each. The information about a
+    Looked at are rigid motions and common shifts, and combinations of the biases of each sensor, of which at most `ALONE`
+    are named, the weakest first. `blocks` is what a prior of the declared scales leaves of each. The information about a
     combination is one over its variance, less that of the prior; what moves along is what the data cannot tell from
     it. A remedy is kept where the information about the biases that it may fix says so, all others uncertain.
     """
     together = shared_directions(problem, at)
-    alone, count = alone_directions(problem, at.point, blocks, most)
+    alone, count = alone_directions(problem, at.point, blocks)
     return (*together, *alone), len(together) + count
 
 
@@ -225,12 +224,10 @@ def _strongest(
     return tuple(sorted(moved, key=lambda group: -moved[group])[:TRIED])
 
 
-def alone_directions(
-    problem: Problem, point: Point, blocks: SensorBlocks, most: int
-) -> tuple[tuple[Direction, ...], int]:
+def alone_directions(problem: Problem, point: Point, blocks: SensorBlocks) -> tuple[tuple[Direction, ...], int]:
     """Combinations of the biases of single sensors that the data leave to the prior, the weakest first, and how many.
 
-    At most `most` are named.
+    At most `ALONE` are named.
     """
     M, members = len(problem.labels), blocks.members
     free = np.append(~problem.surveyed, False)[members]
@@ -239,7 +236,7 @@ def alone_directions(
     weak = np.argwhere(information < WEAK)
     weak = weak[np.argsort(information[tuple(weak.T)], kind="stable")]
     found, why = dict[int, list[tuple[Direction, Pattern]]](), cause(problem, point) if len(weak) else ""
-    for b, k in weak[:most]:
+    for b, k in weak[:ALONE]:
         own = members[b][free[b]]
         part = vectors[b, free[b], k]
         vector = np.zeros(M)

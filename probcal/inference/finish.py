@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 SAVE = ("states", "predictive")
 NAMED = 4  # directions, or biases, that a message names
-ALONE = 20  # combinations of the biases of single sensors that a large fit names
 
 
 def finished(answer: Answer, key: jax.Array, keep: tuple[str, ...], monitor: Monitor) -> tuple[xr.DataTree, Answer]:
@@ -72,8 +71,8 @@ def _directions(answer: Answer) -> tuple[tuple[Direction, ...], int]:
     posterior, information = answer.posterior, answer.posterior.summary.information
     if (blocks := posterior.declared) is not None:
         if not answer.prior.proper:  # a flat prior leaves no room for more
-            return alone_directions(answer.problem, posterior.point, blocks, ALONE)
-        return screened_directions(answer.problem, posterior.expansion, blocks, ALONE)
+            return alone_directions(answer.problem, posterior.point, blocks)
+        return screened_directions(answer.problem, posterior.expansion, blocks)
     if information is None or not linear_form(answer) or not np.isfinite(information).all():
         return (), 0
     found = weak_directions(answer.problem, information, posterior.point)

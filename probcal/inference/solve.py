@@ -18,7 +18,7 @@ from probcal.inference.run import Maximiser
 from probcal.labels import listed
 from probcal.modes import further_starts
 from probcal.modes import optima as optima_of
-from probcal.modes.clocks import first_times, settled_times, taken_there
+from probcal.modes.clocks import ROUNDS, first_times, settled_times, taken_there
 from probcal.modes.explore import MORE, NEAR, SAME, Mirrored, SideClimb, Sides, new, reach
 from probcal.modes.grid import follow_states, grid_start
 from probcal.modes.mirrors import other_sides
@@ -27,7 +27,6 @@ from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.wings import of_wing
 
-ROUNDS = 8  # answers in turn, each with the rows where the one before puts them
 STILL = 0.1  # sd by which no clock moves at the end of them
 
 
@@ -87,7 +86,7 @@ def solve_timed(
     if start is not None:
         points = [_suited(given, problem, start)]
     elif large:
-        points = [grid_start(problem, jax.device_put(problem.first_z), 30)]
+        points = [grid_start(problem)]
     else:
         points = [o.point for o in optima_of(problem, stopped=lambda: bool(monitor.stopped))]
     if method.engined:

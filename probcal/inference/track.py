@@ -59,7 +59,7 @@ def track(
     check_linear(problem)
     engine = choose(problem.model)
     z = jnp.asarray(found.z)
-    tracks = automatic_start(problem) if engine.cheap else grid_start(problem, z, 30)
+    tracks = automatic_start(problem) if engine.cheap else grid_start(problem, z)
     start = at_levels(problem.model, tracks, jnp.asarray(found.levels))
     before, after = start._replace(z=jnp.asarray(problem.first_z)), start._replace(z=z)
     before = engine.settled(problem.model, before).point

@@ -37,13 +37,13 @@ class Optimum(NamedTuple):
 
 
 @float64
-def automatic_start(problem: Problem, iterations: int = 30) -> Point:
+def automatic_start(problem: Problem) -> Point:
     """Trajectories and biases from the data alone, near the joint mode at the declared scales: the best of `optima`."""
-    return optima(problem, iterations)[0].point
+    return optima(problem)[0].point
 
 
 @float64
-def optima(problem: Problem, iterations: int = 30, stopped: Callable[[], bool] = lambda: False) -> list[Optimum]:
+def optima(problem: Problem, stopped: Callable[[], bool] = lambda: False) -> list[Optimum]:
     """Joint modes at the declared scales that the data alone lead to: the best, and those that may be better.
 
     The grid, Viterbi path, motion model and iterated EKS at zero biases, then a few joint steps; the same at the biases
@@ -54,7 +54,7 @@ def optima(problem: Problem, iterations: int = 30, stopped: Callable[[], bool] =
     """
     check_linear(problem)
     measured = problem.at_measured()
-    first = grid_start(problem, jax.device_put(problem.first_z), iterations)
+    first = grid_start(problem)
     found = list[Optimum]()
 
     def proposed() -> Iterator[tuple[Point, bool]]:
@@ -64,13 +64,13 @@ def optima(problem: Problem, iterations: int = 30, stopped: Callable[[], bool] =
             yield first._replace(z=jax.device_put(z)), False
         for family in FAMILIES:
             for z in family(problem):
-                yield grid_start(problem, jax.device_put(problem.first_z + z), iterations), False
+                yield grid_start(problem, problem.first_z + z), False
         best = min(found, key=_value)
         for tracked in exchanged(measured, first, best.point, best.settled):
             yield tracked, True
 
     for start, kept in proposed():
-        one = polished(problem, start, iterations)
+        one = polished(problem, start)
         if kept:
             one = one._replace(value=min(sparse_cost(problem.model, start), one.value), point=start)
         found.append(one)
@@ -97,14 +97,14 @@ def further_starts(problem: Problem, count: int, key: jax.Array) -> list[Point]:
     moved = np.asarray(jax.random.uniform(seeds[1], shape)) < SPARSE
     drawn = np.where(moved, 2.0 * np.asarray(jax.random.normal(seeds[2], shape)), 0.0)
     swapped, others = (
-        ranked(problem, [grid_start(problem, jax.device_put(problem.first_z + z), 30) for z in every])
+        ranked(problem, [grid_start(problem, problem.first_z + z) for z in every])
         for every in ([pairs[k] for k in some], drawn)
     )
     half = swapped[: (count + 1) // 2]
     return [point for _, point in [*half, *others[: count - len(half)]]]
 
 
-def polished(problem: Problem, start: Point, iterations: int) -> Optimum:
+def polished(problem: Problem, start: Point, iterations: int = 30) -> Optimum:
     """The joint mode at the declared scales next to a start, by that with growing stds at the measured values."""
     model = problem.model
     scales = Precision(jnp.ones(model.biases))

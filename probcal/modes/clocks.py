@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 
-import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian.choose import choose
@@ -34,7 +33,7 @@ def first_times(problem: Problem, stopped: Callable[[], bool] = lambda: False) -
         return problem
     for rows, columns in _parts(problem):
         part = problem if rows.all() else problem.select(rows)
-        best = polished(part, grid_start(part, jnp.asarray(part.first_z), 30), 30)
+        best = polished(part, grid_start(part))
         tried = set[int]()
         while (m := _worst(best, columns, tried)) is not None and not stopped():
             tried.add(m)
@@ -50,7 +49,7 @@ def first_times(problem: Problem, stopped: Callable[[], bool] = lambda: False) -
 def settled_times(problem: Problem, point: Point) -> tuple[Problem, Point]:
     """The problem with its rows taken where the joint mode near a point puts them, and that mode."""
     for _ in range(ROUNDS):
-        found = polished(problem, point, 30)
+        found = polished(problem, point)
         far = np.abs(problem.retimed(found.point.z).first_z - problem.first_z).max(initial=0.0)
         problem, point = taken_there(problem, found.point)
         if far < CLOSE:

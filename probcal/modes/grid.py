@@ -259,11 +259,12 @@ def follow_states(problem: Problem, states: list[np.ndarray]) -> Point:
     return project(problem, states, [np.full_like(x, CLOSE) for x in states])
 
 
-def grid_start(problem: Problem, z: jax.Array, iterations: int) -> Point:
-    """Trajectories from the data alone at biases z (M,): grid, Viterbi path, motion model, iterated EKS.
+def grid_start(problem: Problem, z: Any = None, iterations: int = 30) -> Point:
+    """Trajectories from the data alone at biases z (M,), as stated if None: grid, Viterbi path, motion, iterated EKS.
 
     A std that grows is that at the measured value: at the prediction it makes far places fit all data about as well.
     """
+    z = jax.device_put(problem.first_z if z is None else z)
     problem = problem.at_measured()
     places = candidates(problem)
     tracks, precisions = [], []

@@ -136,7 +136,7 @@ def reflected_pieces(problem: Problem, point: Point, most: float = np.inf) -> It
         if len(kept) < LOOKED and not any(piece.alike(other) for other in kept):
             kept.append(piece)
     if kept:
-        again = at_levels(problem.model, grid_start(problem, point.z, 30), point.levels)
+        again = at_levels(problem.model, grid_start(problem, point.z), point.levels)
         yield Candidate(PIECES, PIECE, again)
     for _, r, target, own, plane, _ in kept:
         chosen = [np.zeros(len(epochs.time), bool) for epochs in problem.epochs]

@@ -10,12 +10,12 @@ from probcal.gaussian.information import at_levels
 from probcal.gaussian.mode import Point
 from probcal.labels import AXES
 from probcal.linalg import spectrum
-from probcal.modes.grid import follow_states, known_places
+from probcal.modes.grid import WINDOWS, follow_states, known_places
 from probcal.problem import Problem
 
 FAR = 6.0  # scales beyond which a node is not reflected
 SHIFTED = 0.3  # scales by which nodes must be moved to count as reflected
-WINDOWS, HEARD = 60, 4  # parts of a track in which nodes may be heard alone, and sets of such nodes that are looked at
+HEARD = 4  # sets of nodes that are heard alone in some window of a track, and are looked at
 
 
 class Plane(NamedTuple):

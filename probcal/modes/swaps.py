@@ -75,7 +75,7 @@ def exchanged(problem: Problem, tracked: Point, point: Point, settled: bool) -> 
         if not better:
             return
         best = kept[0][0]
-        starts = [grid_start(problem, z, 30) for z in better]
+        starts = [grid_start(problem, z) for z in better]
         yield from starts
 
 
