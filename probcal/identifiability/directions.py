@@ -177,10 +177,11 @@ def combination(problem: Problem, labels: list[str], vector: np.ndarray, why: st
 def screened_directions(problem: Problem, at: Expansion, blocks: SensorBlocks) -> tuple[tuple[Direction, ...], int]:
     """Directions that the data leave to the prior where biases are too many for a matrix of all, and their number.
 
-    Looked at are rigid motions and common shifts, and combinations of the biases of each sensor, of which at most `ALONE`
-    are named, the weakest first. `blocks` is what a prior of the declared scales leaves of each. The information about a
-    combination is one over its variance, less that of the prior; what moves along is what the data cannot tell from
-    it. A remedy is kept where the information about the biases that it may fix says so, all others uncertain.
+    Looked at are rigid motions and common shifts, and combinations of the biases of each sensor, of which at most
+    `ALONE` are named, the weakest first. `blocks` is what a prior of the declared scales leaves of each. The
+    information about a combination is one over its variance, less that of the prior; what moves along is what the data
+    cannot tell from it. A remedy is kept where the information about the biases that it may fix says so, all others
+    uncertain.
     """
     together = shared_directions(problem, at)
     alone, count = alone_directions(problem, at.point, blocks)

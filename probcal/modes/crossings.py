@@ -142,24 +142,21 @@ class _Own:
         And the information (moving, P, P) about the biases of each at the last step, that of their scales with it. No
         sensor has two of these nodes, so that a node's information is its block of that of all biases.
         """
-        own, after = self.biases[moving], np.append(z, 0.0)
-        node, column = np.full(len(after), -1), np.zeros(len(after), int)  # of each bias: in `moving`, and in its row
+        own, after, node = self.biases[moving], np.append(z, 0.0), np.full(len(z) + 1, -1)
         node[own] = np.arange(len(own))[:, None]
-        column[own] = np.arange(own.shape[1])
         node[-1] = -1
+        each = [node[np.asarray(read)].max(1) for read in model.read]  # the node of each row, -1 of none
         information: np.ndarray = np.eye(own.shape[1])
         for _ in range(STEPS):
-            blocks, pull = np.tile(np.eye(own.shape[1]), (len(own), 1, 1)), -after
-            for read, lin in zip(model.read, _linearised(model, point, jax.device_put(after[:-1])), strict=True):
-                on = np.flatnonzero((node[np.asarray(read)] >= 0).any(1))
-                read, slope, weight, score = (np.asarray(x)[on] for x in (read, lin.bias, lin.weight, lin.score))
-                np.add.at(pull, read, np.sum(score[:, :, None] * slope, 1))
-                values = np.einsum("nc,nca,ncb->nab", weight, slope, slope)
-                i, j = np.broadcast_arrays(read[:, :, None], read[:, None, :])
-                both = (node[i] >= 0) & (node[i] == node[j])
-                np.add.at(blocks, (node[i[both]], column[i[both]], column[j[both]]), values[both])
-            information, pull[-1] = blocks, 0.0
-            change = np.nan_to_num(solve_square(information, pull[own][:, :, None])[:, :, 0])
+            information, pull = np.tile(np.eye(own.shape[1]), (len(own), 1, 1)), -after[own]
+            linearised = _linearised(model, point, jax.device_put(after[:-1]))
+            for read, k, lin in zip(model.read, each, linearised, strict=True):
+                on = np.flatnonzero(k >= 0)
+                k, read, along, weight, score = (np.asarray(x)[on] for x in (k, read, lin.bias, lin.weight, lin.score))
+                slope = along @ (read[:, :, None] == own[k][:, None, :])
+                np.add.at(information, k, np.einsum("nc,nca,ncb->nab", weight, slope, slope))
+                np.add.at(pull, k, np.einsum("nc,nca->na", score, slope))
+            change = np.nan_to_num(solve_square(information, pull[:, :, None])[:, :, 0])
             after[own] += change * STRIDE / np.maximum(np.abs(change).max(1, keepdims=True), STRIDE)
         return after[:-1], information
 
