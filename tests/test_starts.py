@@ -5,12 +5,10 @@ import itertools
 import sys
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from worlds import small
 
 import probcal
 from probcal import Bias, Channel, ConstantVelocity, InputError, Network, Node, Problem, sensor, simulate
@@ -211,18 +209,6 @@ def test_collinear_sensors_of_open_headings_are_no_failure():
 def test_the_place_to_add_a_family_is_one_tuple():
     assert automatic.FAMILIES
     assert all(callable(family) for family in automatic.FAMILIES)
-
-
-def test_rows_alike_are_looked_at_once_with_the_same_losses():
-    problem = small()
-    with jax.enable_x64(True):
-        places, z = grid.candidates(problem)[::40], np.full(problem.model.biases, 0.3)
-        model, span = grid._thinned(problem, 0), problem.epochs[0].position
-        found, whole = grid._losses(problem, 0, z, places), grid._profiled(model, 0, span, z, places)
-        alike = grid._alike(problem, model, 0)
-    assert alike is not None
-    assert all(2 * len(first) <= len(own) for first, own in alike)
-    np.testing.assert_allclose(found, whole, rtol=1e-10)
 
 
 def test_the_cheapest_path_is_that_of_all_paths():

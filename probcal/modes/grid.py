@@ -16,10 +16,9 @@ import numpy as np
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.mode import Point, apart, cost, factors, gains_of, smooth_tracks
-from probcal.model import rows as waist
 from probcal.model import variants
 from probcal.model.model import At, Model, Recursion
-from probcal.model.rows import Linearised, Rows
+from probcal.model.rows import Linearised
 from probcal.model.trajectories import Trajectories
 from probcal.problem import Problem
 
@@ -103,11 +102,7 @@ def profile(model: Model, r: int, span: tuple[int, int], z: jax.Array, place: ja
 
 def _losses(problem: Problem, r: int, z: jax.Array, places: np.ndarray) -> np.ndarray:
     """Loss of every candidate at every epoch, (candidates, E), of rows enough for a place."""
-    model, span = _thinned(problem, r), problem.epochs[r].position
-    alike = _alike(problem, model, r)
-    return np.asarray(
-        _profiled(model, r, span, z, places) if alike is None else _seen(model, r, span, z, places, alike)
-    )
+    return np.asarray(_profiled(_thinned(problem, r), r, problem.epochs[r].position, z, places))
 
 
 @partial(jax.jit, static_argnames=("r", "span"))
@@ -116,56 +111,6 @@ def _profiled(model: Model, r: int, span: tuple[int, int], z: jax.Array, places:
     E = model.recursions[r].drift.shape[0]
     width = span[1] - span[0]
     return jax.lax.map(lambda c: profile(model, r, span, z, jnp.broadcast_to(c, (E, width)))[0], places)
-
-
-def _alike(problem: Problem, model: Model, r: int) -> tuple[tuple[np.ndarray, np.ndarray], ...] | None:
-    """Of each block of recursion r one row a sensor, and which of them each row equals but for what was measured.
-
-    None where a sensor moves or looks at more than the place, where more is profiled, and where few rows are alike.
-    """
-    span, found = set(range(*problem.epochs[r].position)), []
-    if not {name for name, *_ in problem.epochs[r].layout} <= {"position", "velocity", "acceleration"}:
-        return None
-    for block, data, own in model.each_block():
-        if own == r:
-            pose = np.asarray(data.pose)
-            _, first, alike = np.unique(np.asarray(data.sensor), return_index=True, return_inverse=True)
-            if not set(block.used) <= span or 2 * len(first) > len(alike) or (pose[first[alike]] != pose).any():
-                return None
-            found.append((first, alike))
-    return tuple(found)
-
-
-@partial(jax.jit, static_argnames=("r", "span"))
-def _seen(
-    model: Model, r: int, span: tuple[int, int], z: jax.Array, places: jax.Array,
-    alike: tuple[tuple[jax.Array, jax.Array], ...],
-) -> jax.Array:  # fmt: skip
-    """Loss (candidates, E) where rows alike see the same at a place."""
-    mine, n = variants.part(model, r), model.recursions[r].drift.shape[1]
-    levels = jnp.zeros(model.level_spread.shape)
-
-    def one_per_sensor(data: Rows, own: tuple[jax.Array, jax.Array]) -> dict[str, Any]:
-        chosen: dict[str, Any] = {name: getattr(data, name)[own[0]] for name in waist.BY_ROW}
-        return chosen | {"epoch": jnp.zeros_like(own[0])}
-
-    some = mine.with_rows(one_per_sensor, alike)
-
-    def loss(place: jax.Array) -> list[jax.Array]:
-        state, misfits = jnp.zeros((1, n)).at[0, span[0] : span[1]].set(place), []
-        for block, data, _, few, (_, own) in mine.each_block(some.rows, alike):
-            lin = waist.linearise_biases(block, few, state, z, levels, expected=False)
-            spread = jnp.sqrt(jnp.sum(lin.bias**2, -1, keepdims=True))
-            looked = apart((waist.predict(block, few, state, z), spread))
-            predicted, spread = apart(jax.tree.map(lambda part, own=own: part[own], looked))
-            score, weight = waist.weigh(block, data, predicted, levels, expected=False)
-            misfits.append(_misfit(Linearised(score, weight, jnp.zeros((*score.shape, 0)), spread)))
-        return misfits
-
-    found = jnp.zeros((mine.recursions[0].drift.shape[0], len(places)))
-    for _, data, _, misfit in mine.each_block(jax.lax.map(loss, places)):
-        found = found.at[data.epoch].add(misfit.T)  # of all candidates at once
-    return found.T
 
 
 def _viterbi(loss: np.ndarray, places: np.ndarray, steps: np.ndarray) -> np.ndarray:
