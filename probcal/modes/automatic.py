@@ -13,7 +13,7 @@ from probcal.model import variants
 from probcal.model.model import Model
 from probcal.modes.bearings import by_directions, turned
 from probcal.modes.grid import grid_start
-from probcal.modes.swaps import TRIED, exchanged, ranked, swaps
+from probcal.modes.swaps import TRIED, best_fitting, exchanged, swaps
 from probcal.priors import Precision
 from probcal.problem import Problem, check_linear
 from probcal.types import float64
@@ -97,7 +97,7 @@ def further_starts(problem: Problem, count: int, key: jax.Array) -> list[Point]:
     moved = np.asarray(jax.random.uniform(seeds[1], shape)) < SPARSE
     drawn = np.where(moved, 2.0 * np.asarray(jax.random.normal(seeds[2], shape)), 0.0)
     swapped, others = (
-        ranked(problem, [grid_start(problem, problem.first_z + z) for z in every])
+        best_fitting(problem, [grid_start(problem, problem.first_z + z) for z in every])
         for every in ([pairs[k] for k in some], drawn)
     )
     half = swapped[: (count + 1) // 2]

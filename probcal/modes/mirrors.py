@@ -7,7 +7,7 @@ that has no mirror pays for two looks at its data, and one with nodes that may s
 for some thirty.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -65,7 +65,7 @@ def reflected_scenes(problem: Problem, point: Point, most: float = np.inf) -> It
     targets = [n for epochs in problem.epochs for n in epochs.members if n in problem.targets]
     found = planes(problem, z)
     here = _losses(problem, z, point, None) if found else []
-    parts = [("the targets", free)] if len(targets) > 1 else []
+    parts: list[tuple[str, Sequence[np.ndarray]]] = [("the targets", free)] if len(targets) > 1 else []
     for name in targets[:MOST]:
         own = problem.model.each(lambda _, mine, own, n=name: mine & (own.target == n), free, problem.epochs)
         parts.append((f'target "{name}"', own))

@@ -31,7 +31,7 @@ class StraightTrack(NamedTuple):
         return slope @ self.covariance @ slope.mT
 
 
-def wrapped(angle: np.ndarray) -> np.ndarray:
+def wrapped(angle: Any) -> Any:
     """Angles in rad from -pi to pi."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 

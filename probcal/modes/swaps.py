@@ -62,7 +62,7 @@ def exchanged(problem: Problem, tracked: Point, point: Point, settled: bool) -> 
     if not far or (settled and max(far.values()) < GROSS):
         return
     order = sorted(swaps(problem), key=lambda pair: -max(far[pair[0]], far[pair[1]]))[:TRIED]
-    best, starts = ranked(problem, [track_mode(problem, tracked, SCREENED)])[0][0], [tracked]
+    best, starts = best_fitting(problem, [track_mode(problem, tracked, SCREENED)])[0][0], [tracked]
     for _ in range(ROUNDS):
         tried = {
             exchange.round(6).tobytes(): start._replace(z=jax.device_put(exchange))
@@ -70,7 +70,7 @@ def exchanged(problem: Problem, tracked: Point, point: Point, settled: bool) -> 
             for pair, exchange in swaps(problem, np.asarray(start.z)).items()
             if pair in order
         }
-        kept = ranked(problem, [track_mode(problem, start, SCREENED) for start in tried.values()])[:KEPT]
+        kept = best_fitting(problem, [track_mode(problem, start, SCREENED) for start in tried.values()])[:KEPT]
         better = [point.z for value, point in kept if value < best - GAIN]
         if not better:
             return
@@ -79,7 +79,7 @@ def exchanged(problem: Problem, tracked: Point, point: Point, settled: bool) -> 
         yield from starts
 
 
-def ranked(problem: Problem, points: Sequence[Point]) -> list[tuple[float, Point]]:
+def best_fitting(problem: Problem, points: Sequence[Point]) -> list[tuple[float, Point]]:
     """Points and their joint costs under a flat prior, those first that fit best."""
     flat = Precision(jnp.zeros(len(problem.labels)))
     costs = np.nan_to_num([float(joint_cost(problem.model, point, flat)) for point in points], nan=np.inf)
