@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ import xarray as xr
 from probcal import linalg
 from probcal.errors import InputError, nearest
 from probcal.gaussian.mode import factors
+from probcal.inference.fitted import take_up
 from probcal.labels import AXES, NOBODY
 from probcal.linalg import root_of
 from probcal.model.model import At, Data, Model
@@ -24,6 +25,10 @@ from probcal.types import float64
 
 BATCH = (256, 200_000)  # cells worked on at once, and entries of their matrices
 LOST = 1e-13  # share of the information of a position below which a direction counts as open
+APART = (
+    "The covariance between the biases of different sensors is left out: the fit holds that of each"
+    " sensor. Fit fewer sensors, or give the problem as it was fitted."
+)
 
 
 @float64
@@ -41,10 +46,10 @@ def bound_map(
 
     The position is free; every further state component has its start as prior (its mean is where it is evaluated).
     `biases` are `"known"` (the stated values), `"unknown"` (marginalised with one scale or their survey) or a fit:
-    its means with its covariance, of a large fit that of each sensor alone, as if sensors were
-    independent. `cells` along x and y, `z` the height in m of a 3-D map, `target` whose motion is
-    taken (the first), `time` at which moving nodes are met (the first). Of the table no more than
-    that is used.
+    its means with its covariance. Of a large fit that of all is found anew from its `problem`; above
+    600 biases, or of another table, sensors count as independent: the attribute `note` says so.
+    `cells` along x and y, `z` the height in m of a 3-D map, `target` whose motion is taken (the
+    first), `time` at which moving nodes are met (the first).
 
     Variables over (y, x): `rmse` = sqrt tr J^-1 in m (thesis 4.4.2, RSS paper 22-23), `trace` and `smallest` eigenvalue
     of the information J in 1/m^2 (RSS paper 20-21), `determined`. A bound beyond the diagonal of the area is no
@@ -67,7 +72,7 @@ def bound_map(
             raise InputError("bound_map: the tree of biases has no group calibration; give the result of fit()")
         found = apply(at, biases)
         at, mean, levels = found.problem, found.z, found.levels
-        spread = found.spread
+        spread = _coupled(problem, biases, at.labels, found.spread)
     elif biases == "unknown":
         spread = SensorBlocks(M, np.arange(M)[:, None], np.ones((M, 1, 1)))
     elif biases != "known":
@@ -91,7 +96,30 @@ def bound_map(
         coords={"x": x, "y": y, "node": [n.name for n in at.network.nodes], "axis": list(AXES[:d])},
         attrs={"biases": biases if isinstance(biases, str) else "fitted", "target": at.measurements.target_names[0]},
     )
+    if spread is not None and not spread.whole and drawn.attrs["biases"] == "fitted":
+        drawn.attrs["note"] = APART
     return drawn if z is None else drawn.assign_coords(z=float(z))
+
+
+def _coupled(problem: Problem, fit: xr.DataTree, labels: Any, spread: SensorBlocks) -> SensorBlocks:
+    """The covariance of all biases: the sds of a fit, its correlations where it ended.
+
+    That of each sensor alone where these are not to be had.
+    """
+    if spread.whole:
+        return spread
+    try:
+        own = take_up(problem, fit)
+    except InputError:  # a problem of other data
+        return spread
+    information = own.expansion.information()
+    if information is None:
+        return spread
+    order = np.array([problem.labels.index(label) for label in labels])
+    whole = linalg.invert(information + own.factors.matrix(len(information)))
+    covariance = whole[order[:, None], order]
+    wide = np.sqrt(spread.variance / np.diagonal(covariance))
+    return SensorBlocks.of(covariance).widened(wide)
 
 
 def _axes(area: Sequence[Sequence[float]], cells: int | tuple[int, int]) -> list[np.ndarray]:
