@@ -62,7 +62,7 @@ VERBS = {  # what each answers in numbers to the world, by the fit of an engine 
     "fit": lambda at, engine: fitted(engine)["calibration"]["mean"],
     "observability": lambda at, engine: pc.observability(at.problem, point=at.start)["bias"]["share"],
     "bounds": lambda at, engine: pc.bounds(at.problem, kind="hybrid", truth=at.truth, draws=3)["bias"]["sd"],
-    "bound_map": lambda at, engine: pc.bound_map(at.problem, AREA, cells=3, biases=fitted(engine)).rmse,
+    "bound_map": lambda at, engine: pc.bound_map(at.problem, AREA, biases=fitted(engine), cells=3).rmse,
     "next_passes": lambda at, engine: pc.next_passes(at.problem, point=at.start, passes=LINES)["gain"],
     "next_anchors": lambda at, engine: pc.next_anchors(at.problem, point=at.start)["gain"],
     "next_sensors": lambda at, engine: pc.next_sensors(at.problem, point=at.start, places=PLACES)["gain"],

@@ -46,8 +46,8 @@ def bound_map(
 
     The position is free; every further state component has its start as prior (its mean is where it is evaluated).
     `biases` are `"known"` (the stated values), `"unknown"` (marginalised with one scale or their survey) or a fit:
-    its means with its covariance. Of a large fit that of all is found anew from its `problem`; above
-    600 biases, or of another table, sensors count as independent: the attribute `note` says so.
+    its means with its covariance. Of a large fit that of all is found anew from its `problem`;
+    above 600 biases, or of another table, sensors count as independent: attribute `note` says so.
     `cells` along x and y, `z` the height in m of a 3-D map, `target` whose motion is taken (the
     first), `time` at which moving nodes are met (the first).
 
