@@ -46,6 +46,20 @@ def named(engine):
 
 
 @cache
+def unnamed():
+    """Detections of two targets without names, by a radar that is known and one that is not."""
+    report, looks = pc.Detection(0.9, clutter=1.0, view=pc.Sector(range=3000.0)), np.arange(12.0)
+    nodes = [pc.Node("west", (0.0, 0.0)), pc.Node("east", (1000.0, 0.0), scale={"position": 20.0})]
+    network = pc.Network([pc.sensors.radar.on(node, detection=report) for node in nodes])
+    motion = dict.fromkeys("st", pc.ConstantVelocity(0.5))
+    line = np.outer(looks, [15.0, 5.0])
+    tracks = {"s": line + np.array([300.0, 600.0]), "t": line + np.array([300.0, -500.0])}
+    table = pc.simulate(network, motion, looks, tracks=tracks, key=1).table
+    start = {"position": ((300.0, 0.0), 1500.0), "velocity": ((0.0, 0.0), 12.0)}
+    return pc.Problem(network, pc.Target(motion["s"], start), table)
+
+
+@cache
 def fitted(engine, later=False):
     """The tree of the world's mode as `MAP` leaves it."""
     problem = world().later if later else world().problem
@@ -75,17 +89,11 @@ VERBS = {  # what each answers in numbers to the world, by the fit of an engine 
     "simulate": lambda at, engine: pc.simulate(at.problem.network, at.problem.motion, range(3)).table["azimuth"],
 }
 ENGINED = ("EA", "EMEA", "EM", "MAP", "LeastSquares")
-METHODS = (
-    {name: lambda engine, name=name: getattr(pc, name)(engine=named(engine)) for name in ENGINED}
-    | {
-        "Gibbs": lambda engine: pc.Gibbs(chains=2, warmup=10, draws=10),
-    }
-    | {  # detections without names, which `SelfConfiguration` asks for, are another world
-        name: lambda engine, name=name: getattr(pc, name)()
-        for name in of_priors().index
-        if name not in (*ENGINED, "Gibbs", "SelfConfiguration")
-    }
-)
+OWN = {name: lambda engine, name=name: getattr(pc, name)(engine=named(engine)) for name in ENGINED} | {
+    "Gibbs": lambda engine: pc.Gibbs(chains=2, warmup=10, draws=10),
+    "SelfConfiguration": lambda engine: pc.SelfConfiguration(pc.MAP(engine=named(engine))),
+}
+METHODS = {name: OWN.get(name, lambda engine, name=name: getattr(pc, name)()) for name in of_priors().index}
 NOT = {  # what is not done, by the heading of a column: part of the sentence that says so
     "observability": {"iterative": "without a factor of the biases variances"},
     "changes": {"above 600 biases": "changes needs the information of all biases"},
@@ -93,7 +101,7 @@ NOT = {  # what is not done, by the heading of a column: part of the sentence th
     "EMEA": {"iterative": GIVEN},
 } | {
     name: dict.fromkeys(list(KINDS.values())[1:], DENSE)
-    for name in METHODS if name not in (*ENGINED, "Gibbs")
+    for name in METHODS if name not in OWN
 }  # fmt: skip
 
 APART = {("bound_map", "many"): 0.2}  # share of numbers, of sensors taken as independent
