@@ -304,7 +304,7 @@ def warehouse_linear(seed, declared):
         first = prior.precision(problem.labels, problem.surveyed)
         known = Natural(jnp.asarray(matrix), jnp.asarray(pull), jnp.zeros(0), first)
         keys = jax.random.split(jax.random.key(seed))
-        _, swept = run_sweeps(form, known, begin(form, known, keys[0]), keys[1], KEPT)
+        _, swept = run_sweeps(form, known, begin(form), keys[1], KEPT)
         phi = swept.phi or {"none": jnp.zeros((4, KEPT))}
         found = jax.device_get(moments(form, known, phi))
     sure = 1.0 - np.diagonal(np.linalg.inv(matrix + np.eye(len(z)))) > 0.5

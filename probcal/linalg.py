@@ -65,9 +65,6 @@ def inverse_cholesky(matrix: jax.Array) -> jax.Array:
     return jnp.stack(rows)
 
 
-inverse_choleskys = jax.jit(jax.vmap(inverse_cholesky))  # of matrices (E, n, n)
-
-
 def observe(root: jax.Array, columns: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Root of a covariance (n, n) root root' after unit-noise data columns' x, for columns (n, u), one after another.
 

@@ -34,7 +34,8 @@ from probcal import (
 from probcal.analysis import findings, verdict
 from probcal.diagnostics import study_table
 from probcal.errors import FitError
-from probcal.gaussian.information import mean_square, squares_of
+from probcal.gaussian.draws import residuals
+from probcal.gaussian.information import mean_square
 from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import _proposal, eliminate, find_mode
 from probcal.geometry import bearing, norm
@@ -483,7 +484,7 @@ def test_outliers_of_heavy_noise_and_rare_events_are_no_misfit():
     with jax.enable_x64(True):
         problem = Problem(network, known, table)
         point = resting(problem)
-        (square,) = squares_of(problem.model, point)
+        (square,) = residuals(problem.model, point).square
         assert square.shape == (8, 3)
         assert float(square[:, 0].max()) < 3.0, "the score of a Student-t is bounded"
         assert float(square[3, 1]) < 100.0, "an echo counts by its own width"

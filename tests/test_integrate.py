@@ -66,8 +66,7 @@ def mixture(prior, matrix=G, pull=PULL, group=(0, 1, 2), key=0):
     form = Form(3, kind_of(prior, group))
     with jax.enable_x64(True):
         known = Natural(jnp.asarray(matrix), jnp.asarray(pull), jnp.zeros(0), Precision(jnp.ones(3)))
-        keys = jax.random.split(jax.random.key(key))
-        _, swept = run_sweeps(form, known, begin(form, known, keys[0]), keys[1], KEPT)
+        _, swept = run_sweeps(form, known, begin(form), jax.random.key(key), KEPT)
         found = jax.tree.map(np.asarray, moments(form, known, swept.phi))
         return found, np.asarray(swept.z), np.asarray(swept.mean)
 
@@ -112,7 +111,7 @@ def test_sweeps_go_on_without_another_burn_in():
     with jax.enable_x64(True):
         known = Natural(jnp.asarray(G), jnp.asarray(PULL), jnp.zeros(0), Precision(jnp.ones(3)))
         key = jax.random.key(0)
-        chains = begin(form, known, key)
+        chains = begin(form)
         (ends, both), (_, last) = (run_sweeps(form, known, chains, key, 2 - burn, burn) for burn in (0, 1))
     np.testing.assert_array_equal(both.z[:, 1], last.z[:, 0])
     np.testing.assert_array_equal(both.z[:, 1], ends[0])

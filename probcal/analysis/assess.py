@@ -2,7 +2,6 @@
 
 from collections import ChainMap
 
-import jax
 import numpy as np
 import xarray as xr
 
@@ -14,7 +13,7 @@ from probcal.inference.fitted import take_up
 from probcal.inference.widen import said, sentence, unwidened, widened
 from probcal.problem import Problem
 from probcal.results.groups import along, bias_coords
-from probcal.simulate import Key, Truth, as_key
+from probcal.simulate import Key, Truth, as_key, derived_keys
 from probcal.status import Status
 from probcal.types import float64
 
@@ -50,7 +49,7 @@ def assess(problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, k
     'determined'
     """
     tree = unwidened(tree)  # what a fit made of its innovations is judged anew
-    case = Case(take_up(problem, tree), tree, truth, jax.random.split(as_key(key), 3))
+    case = Case(take_up(problem, tree), tree, truth, derived_keys(as_key(key), range(3)))
     with np.errstate(all=None if "explained" in case.has else "ignore"):  # squares of absurd residuals overflow
         return _assessed(case)
 

@@ -47,7 +47,7 @@ class Case:
     fit: Judged
     tree: xr.DataTree
     truth: Truth | None
-    keys: jax.Array  # of the draws, of the replicas, of what a check draws itself
+    keys: list[jax.Array]  # of the draws, of the replicas, of what a check draws itself
 
     @cached_property
     def has(self) -> frozenset[str]:

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 import xarray as xr
 from scipy import special
@@ -49,7 +48,7 @@ def of_positions(target: str, track: xr.Dataset, states: np.ndarray, truth: Trut
         return None
     known[known] = free
     draws, deviation, covariance = draws[:, free], deviation[:, free], covariance[free]
-    whiten = np.asarray(linalg.inverse_choleskys(jax.device_put(covariance)))
+    whiten = linalg.invert(linalg.cholesky(covariance))
     error = track["mean"].sel(component=axes).values[known] - true[known]
     value = (np.einsum("eij,ej->ei", whiten, error) ** 2).mean(1)
     own = (np.einsum("eij,sej->sei", whiten, deviation) ** 2).mean((1, 2))

@@ -8,7 +8,6 @@ between the pieces while all others stay common: exact on a linear problem.
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from probcal.analysis.verdict import limit_of
@@ -65,10 +64,10 @@ def with_differences(fit: Judged, along: np.ndarray) -> Expansion:
     """
     model, own = fit.problem.model, [along[index] for index in fit.problem.row_index]
     rows = tuple(
-        lin._replace(bias=jnp.concatenate([lin.bias, *(lin.bias * by[:, None, None] for by in times.T)], 2))
+        lin._replace(bias=np.concatenate([lin.bias, *(np.multiply(lin.bias, by[:, None, None]) for by in times.T)], 2))
         for *_, lin, times in model.each_block(fit.lins, own)
     )
-    point = fit.point._replace(z=jnp.pad(fit.point.z, (0, along.shape[1] * model.biases)))
+    point = fit.point._replace(z=np.pad(fit.point.z, (0, along.shape[1] * model.biases)))
     return fit.engine.at(variants.differing(model, own), point, rows)
 
 

@@ -55,25 +55,25 @@ def _discrepancies(
     """By draw, data or replica, sensor and channel (D, 2, 2, S, C): -log p and sum of scores; fourth powers (N, C)."""
 
     def one(fourth: list[jax.Array], given: tuple[FitDraws, jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
-        draw, seed = given
+        draw, number = given
         at = At(draw.states, draw.z, draw.levels)
-        replicas = model.sample(at, seed) if draw.replicas is None else draw.replicas
+        replicas = model.sample(at, jax.random.fold_in(key, number)) if draw.replicas is None else draw.replicas
         here = at._replace(levels=levels)  # what is compared is judged at one noise level
 
-        def of(version: Model) -> tuple[list[jax.Array], list[jax.Array]]:
+        def of(values: Any) -> tuple[list[jax.Array], list[jax.Array]]:
+            version = model.with_values(values)
             v = [standardised(score, weight) for score, weight in version.score(here)]
             pairs = zip(version.log_likelihood(here), v, sensors, strict=True)
             sums = [jax.ops.segment_sum(jnp.stack([-own, value], 1), sensor, count) for own, value, sensor in pairs]
             return sums, [value**4 for value in v]
 
-        data, _ = of(model)
-        replica, powers = of(model.with_values(replicas))
-        found = [jnp.stack(pair) for pair in zip(data, replica, strict=True)]
-        return [a + b for a, b in zip(fourth, powers, strict=True)], found
+        measured = [data.y for data in model.rows]
+        found, powers = jax.lax.map(of, [jnp.stack(pair) for pair in zip(measured, replicas, strict=True)])
+        return [a + b[1] for a, b in zip(fourth, powers, strict=True)], found
 
     total = drawn.z.shape[0]
     nothing = [jnp.zeros(there.shape) for there in model.measured]
-    fourth, found = jax.lax.scan(one, nothing, (drawn, jax.random.split(key, total)))
+    fourth, found = jax.lax.scan(one, nothing, (drawn, jnp.arange(total)))
     return found, [power / total for power in fourth]
 
 
@@ -109,9 +109,9 @@ def draws_of(fit: Judged, tree: xr.DataTree, key: jax.Array) -> FitDraws:
         return values.reshape(total, *values.shape[2:])[chosen]
 
     z = jax.device_put(thin(posterior["bias"].values) / problem.scales)
-    levels = jnp.broadcast_to(fit.point.levels, (most, len(problem.levels)))
+    levels: Any = np.broadcast_to(fit.point.levels, (most, len(problem.levels)))
     if "level" in posterior:
-        levels = jnp.asarray(level_logs(problem.levels, thin(posterior["level"].values)))
+        levels = np.asarray(level_logs(problem.levels, thin(posterior["level"].values)))
     if any("state" not in track for track in tracked.values()):
         states = tuple(map(jax.device_put, draw(fit.expansion, z, levels, key).states))
         return FitDraws(z, levels, states, None)

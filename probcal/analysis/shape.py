@@ -5,17 +5,15 @@ of parameters that the data tell, so by half a nat a datum at most. Draws that l
 fall without limit: bearings of an array that is small beside the distance tell the range by a factor only.
 """
 
-import jax
+import numpy as np
 
 from probcal.analysis.check import Case, Checked, check
 from probcal.analysis.findings import Finding
-from probcal.gaussian.mode import log_likelihood
+from probcal.gaussian.draws import residuals
 from probcal.results.read import summed_log_likelihood
 
 LINEAR, MOST = 0.5, 0.75  # nats a datum: at most of a linear model, and from which it is a finding
 GAUSSIAN = ("Laplace", "mixture")  # kinds of answers that draw from Gaussians around a mode
-
-_log_likelihood = jax.jit(log_likelihood)
 
 
 @check("answer")
@@ -24,7 +22,7 @@ def check_shape(case: Case) -> Checked:
     fit, drawn = case.fit, summed_log_likelihood(case.tree)
     if case.tree.attrs["approximate"] not in GAUSSIAN or drawn is None:
         return Checked()
-    mode = float(_log_likelihood(fit.problem.untilted.model, fit.point))  # draws are those of rows alone
+    mode = sum(float(np.asarray(part).sum()) for part in residuals(fit.problem.model, fit.point).log_likelihood)
     fall = (mode - float(drawn.median())) / len(fit.data)
     if not fall > MOST:
         return Checked()

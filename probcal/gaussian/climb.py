@@ -96,8 +96,9 @@ def find_marginal_mode(
     else:
         s = climb_traced(_Traced(model, prior), start, model.biases, iterations, tolerance)
         solved = s.at.solved
+    volume = library(solved.logdet).multiply(0.5, solved.logdet)
     refused = (s.taken <= 1) & ~s.converged
-    return Mode(s.at.point, s.value, s.count - 1, s.converged, refused, s.begun - s.value, 0.5 * solved.logdet), solved
+    return Mode(s.at.point, s.value, s.count - 1, s.converged, refused, s.begun - s.value, volume), solved
 
 
 class Climbed(NamedTuple):

@@ -28,6 +28,7 @@ from probcal.gaussian.solves import Dense
 from probcal.linalg import without_negative
 from probcal.model.model import Data, Model
 from probcal.model.rows import Linearised
+from probcal.simulate import derived_keys
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,10 @@ class DenseExpansion:
 
     def log_det(self, factors: Factors) -> Estimate:
         """Log determinant of the precision of the biases."""
-        return Estimate(float(_log_det(self._precision(factors))))
+        try:
+            return Estimate(2.0 * float(np.sum(np.log(np.diagonal(np.linalg.cholesky(self._precision(factors)))))))
+        except np.linalg.LinAlgError:  # it is not positive definite
+            return Estimate(np.nan)
 
     def solve(self, factors: Factors, right: Any) -> np.ndarray:
         """Covariance of the biases times right, (M,) or (M, K)."""
@@ -166,7 +170,7 @@ class DenseExpansion:
 
     def deviations(self, factors: Factors, key: jax.Array, count: int) -> Sampled:
         """Biases and states drawn around zero, as they differ from their mean."""
-        keys = jax.random.split(key)
+        keys = derived_keys(key)
         dz = _solved(self._precision(factors)).draw(keys[0], count)
         states = draw_trajectories(self, self.point.z[None] + dz, keys[1])
         return Sampled(dz, self.model.each(lambda _, x, mean: x - mean[None], states, self.point.states))
@@ -185,7 +189,6 @@ class DenseExpansion:
 
 
 _solved = jax.jit(Dense.of)
-_log_det = jax.jit(lambda precision: Dense.of(precision).log_determinant())
 _moved = jax.jit(follow)
 
 

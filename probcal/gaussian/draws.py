@@ -14,6 +14,7 @@ from probcal.gaussian.engine import Expansion
 from probcal.gaussian.mode import Eliminated, Point
 from probcal.model.model import At, Data, Model
 from probcal.model.rows import Linearised
+from probcal.simulate import derived_keys
 
 PASS = 200  # draws that are made at once
 VALUES = 4_000_000  # of all states that are drawn at once, at most
@@ -62,7 +63,7 @@ def draw(
     passes, large = [], many_data(at.model)
     for k, start in enumerate(range(0, count, size)):
         chosen = np.minimum(np.arange(start, start + size), count - 1)  # the last pass is filled with its last draw
-        seeds = jax.random.split(jax.random.fold_in(key, k))
+        seeds = derived_keys(key, (2 * k, 2 * k + 1))
         mine = jax.device_put(biases[chosen])
         states = draw_trajectories(at, mine, seeds[0])
         by_datum: tuple[Data, Data] = ((), ())
@@ -87,8 +88,10 @@ def simulated(at: Expansion, pulls: Sequence[Any], key: jax.Array) -> list[tuple
 
     `pulls` (E, n, D) are added to the scores of the states.
     """
-    given = [(own.L, own.half) for own in at.given_biases()]
-    return _simulated(at.model, at.eliminated, given, tuple(pulls), key)
+    given, seed = [(own.L, own.half) for own in at.given_biases()], np.asarray(jax.random.key_data(key))
+    rng = np.random.default_rng(seed)
+    noises = tuple(rng.standard_normal((2, *pull.shape)) for pull in pulls)
+    return _simulated(at.model, at.eliminated, given, tuple(pulls), noises)
 
 
 @jax.jit
@@ -97,11 +100,10 @@ def _simulated(
     solved: Eliminated,
     roots: Sequence[tuple[jax.Array, jax.Array]],
     pulls: Sequence[Any],
-    key: jax.Array,
+    noises: Sequence[Any],
 ) -> list[tuple[jax.Array, rec.Smoothed]]:
     found = []
-    for r, (part, (L, half), kept, pull) in enumerate(model.each_layout(roots, solved.parts, pulls)):
-        noise = jax.random.normal(jax.random.fold_in(key, r), (2, *pull.shape))
+    for part, (L, half), kept, pull, noise in model.each_layout(roots, solved.parts, pulls, noises):
         prior = rec.trajectory(part.F, L, jnp.zeros((*part.drift.shape, 1)), noise[0])
         found.append((prior, rec.smooth(part.F, kept.gain, kept.J @ prior + half @ noise[1] + pull)))
     return found
@@ -129,12 +131,12 @@ def predictive(
     """Log-likelihood and replicas (D, N, C) of every datum at draws, one draw after the other; empty if not kept."""
 
     def one(draw: Any) -> tuple[Data, Data]:
-        levels, z, states, seed = draw
+        levels, z, states, number = draw
         at = At(states, z, levels)
         density = model.log_likelihood(at) if "log_likelihood" in keep else ()
-        return density, model.sample(at, seed) if "replicas" in keep else ()
+        return density, model.sample(at, jax.random.fold_in(key, number)) if "replicas" in keep else ()
 
-    return jax.lax.map(one, (levels, z, states, jax.random.split(key, z.shape[0])))
+    return jax.lax.map(one, (levels, z, states, jnp.arange(len(z))))
 
 
 class Remainder(NamedTuple):
@@ -143,9 +145,12 @@ class Remainder(NamedTuple):
     innovation: Data
     std: Data  # noise level
     reliance: Data  # 1 inlying, towards 0 outlying
+    square: Data  # 1 expected
+    log_likelihood: Data
 
 
 @jax.jit
 def residuals(model: Model, point: Point) -> Remainder:
-    """Innovation, noise level and reliance of every datum at a point."""
-    return Remainder(model.innovation(point), model.spread_of_noise(point), model.reliance(point))
+    """What is left of every datum at a point."""
+    parts = model.innovation, model.spread_of_noise, model.reliance, model.square, model.log_likelihood
+    return Remainder(*(part(point) for part in parts))

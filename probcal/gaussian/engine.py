@@ -222,7 +222,7 @@ def told_alone(at: Expansion) -> np.ndarray:
     """Information (M,) of the rows about each bias, all other biases and the tracks known."""
     found = np.zeros(at.model.biases + 1)
     for *_, read, lin in at.model.each_block(at.model.read, at.rows):
-        np.add.at(found, read, np.einsum("nc,ncp->np", lin.weight, lin.bias**2))
+        np.add.at(found, read, np.einsum("nc,ncp,ncp->np", lin.weight, lin.bias, lin.bias))
     return found[:-1]
 
 

@@ -60,18 +60,12 @@ def rejected(problem: Problem, point: Point) -> list[Rejected]:
     return sorted(found, key=lambda one: -one.below)
 
 
-@jax.jit
-def squares_of(model: Model, point: Point) -> Data:
-    """Square of what a point leaves of every datum (N, C) of each block, 1 expected, zero where missing."""
-    return model.square(point)
-
-
-@jax.jit
-def mean_square(model: Model, point: Point) -> jax.Array:
+@np.errstate(over="ignore", invalid="ignore")  # an absurd point is far out, which its square says
+def mean_square(model: Model, point: Point) -> float:
     """Squares of all data and whitened noises a datum: about 1 at most where the model is right."""
-    count = sum(jnp.sum(there) for there in model.measured)
-    squares = sum(jnp.sum(part) for part in squares_of(model, point))
-    return (squares + point.trajectories.square) / jnp.maximum(count, 1)
+    parts = (*residuals(model, point).square, *map(np.square, point.noises)), model.measured
+    squares, count = (sum(float(np.asarray(part).sum()) for part in own) for own in parts)
+    return squares / max(count, 1.0)
 
 
 def growing_square(model: Model, point: Point) -> float:
@@ -79,7 +73,7 @@ def growing_square(model: Model, point: Point) -> float:
     grown = [own.growing for own in model.blocks]
     if not any(grown):
         return 0.0
-    pairs = list(zip(grown, squares_of(model, point), model.measured, strict=True))
+    pairs = list(zip(grown, residuals(model, point).square, model.measured, strict=True))
     square, count = (sum(float(np.asarray(pair[k])[:, list(pair[0])].sum()) for pair in pairs) for k in (1, 2))
     return square / max(count, 1.0)
 

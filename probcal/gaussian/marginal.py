@@ -15,7 +15,7 @@ from probcal.gaussian.mode import Eliminated, Point, factors, log_likelihood
 from probcal.model.model import At, Model
 
 States = tuple[jax.Array, ...]  # (E, n) of each recursion
-ROUNDS, EXACT = 30, 1e-14  # of an adjoint solve at most, and the share of its first square that ends it
+ROUNDS, EXACT = 31, 1e-14  # of an adjoint solve at most, and the share of its first square that ends it
 SMALL = 1e-6  # share of its first square from which on an adjoint solve is good enough
 
 
@@ -27,7 +27,8 @@ def volume_slope(
 
     `only` (E,) of each recursion marks the epochs of the targets that count; all without it.
 
-    d log det W = sum over k of tr(P_k dJ_k), P_k the smoothed covariance of the states given z. The way through the
+    d log det W = sum over k of tr(P_k dJ_k), P_k the smoothed covariance of the states given z, J_k the sum of the
+    information of the rows of an epoch. The way through the
     trajectories is one adjoint smooth with the second derivatives of the density (see `_adjoint`). Where a target
     stands on a cusp, at the place of a sensor, there is none: the derivative is zero and the second value False.
     """
@@ -43,29 +44,25 @@ def volume_slope(
 
     def volume(z: jax.Array, states: States) -> jax.Array:
         lins = model.linearise(At(states, z, point.levels), expected=True)
-        pairs = zip(counted, model.of_states(lins), strict=True)
-        return sum((jnp.sum(P * J) for P, (J, _) in pairs), jnp.zeros(()))
+        pairs = zip(lins, model.state_variance(lins, counted), strict=True)
+        return sum((jnp.sum(lin.weight * own) for lin, own in pairs), jnp.zeros(()))
 
     own, by_state = jax.grad(volume, argnums=(0, 1))(point.z, point.states)
-    moved, sound = _adjoint(model, point, solved, spread, by_state)
-
-    def along(z: jax.Array) -> jax.Array:
-        """Slope of the log-likelihood along the adjoint states."""
-        return jax.jvp(lambda x: log_likelihood(model, At(x, z, point.levels)), (point.states,), (moved,))[1]
-
-    slope = own + jax.grad(along)(point.z)
+    through, sound = _adjoint(model, point, solved, spread, by_state)
+    slope = own + through
     sound = sound & jnp.all(jnp.isfinite(slope))
     return jnp.where(sound, slope, 0.0), sound
 
 
 def _adjoint(
     model: Model, point: Point, solved: Eliminated, spread: list[jax.Array], slope: States
-) -> tuple[States, jax.Array]:
-    """Solve H x = slope (E, n), H the second derivatives of the negative log density by the trajectories.
+) -> tuple[jax.Array, jax.Array]:
+    """How a slope by the states (E, n) reaches the biases through the trajectories: K x (M,), H x = slope.
 
+    H and K are the second derivatives of the negative log density by the trajectories, and by these and the biases.
     Smoothing, S, solves with the expected information in the place of the observed; `spread` are its covariances
     (E, n, n). With R what the two differ by, x = S y where (I + R S) y = slope: conjugate gradients in the inner
-    product of S, one smooth each (Saad 2003, 6.7).
+    product of S, one smooth each (Saad 2003, 6.7), of which K x is the sum.
     Also whether it is positive all the way: elsewhere the trajectories are at no mode.
     """
 
@@ -73,35 +70,35 @@ def _adjoint(
         parts = model.each_layout(solved.parts, spread, right)
         return tuple(rec.respond(kept.gain, P, b[:, :, None])[:, :, 0] for _, kept, P, b in parts)
 
-    score = jax.grad(lambda x: log_likelihood(model, At(x, point.z, point.levels)))
+    score = jax.grad(lambda x, z: log_likelihood(model, At(x, z, point.levels)), argnums=(0, 1))
 
-    def rest(x: States) -> States:
-        """What the observed information adds to the expected, times x."""
-        observed = jax.jvp(score, (point.states,), (x,))[1]
-        parts = model.each_layout(solved.parts, observed, x)
-        return tuple(-own - jnp.einsum("eij,ej->ei", kept.J, v) for _, kept, own, v in parts)
+    def observed(x: States) -> tuple[States, jax.Array]:
+        """What the observed information adds to the expected, times x, and minus K x."""
+        by_state, by_bias = jax.jvp(lambda at: score(at, point.z), (point.states,), (x,))[1]
+        parts = model.each_layout(solved.parts, by_state, x)
+        return tuple(-own - jnp.einsum("eij,ej->ei", kept.J, v) for _, kept, own, v in parts), by_bias
 
     def on(state: Any) -> jax.Array:
         *_, left, count, positive = state
-        return (count < ROUNDS) & (left > EXACT * dot(slope, first)) & positive
+        return (count < ROUNDS) & (left > EXACT * whole) & positive
 
     def again(state: Any) -> Any:
-        x, r, p, along, left, count, _ = state
-        image = add(p, 1.0, rest(along))
+        through, r, p, along, left, count, _ = state
+        rest, moved = observed(along)
+        image = add(p, 1.0, rest)
         curved = dot(along, image)
         length = jnp.where(curved > 0, left / curved, 0.0)
-        x, r = add(x, length, along), add(r, -length, image)
+        r = add(r, -length, image)
         s = smooth(r)
         after = dot(r, s)
         turn = after / left
-        return x, r, add(r, turn, p), add(s, turn, along), after, count + 1, curved > 0
+        return through + length * moved, r, add(r, turn, p), add(s, turn, along), after, count + 1, curved > 0
 
     first = smooth(slope)
-    r = jax.tree.map(jnp.negative, rest(first))
-    s = smooth(r)
-    start = (first, r, r, s, dot(r, s), jnp.zeros((), int), jnp.ones((), bool))
-    x, _, _, _, left, _, positive = jax.lax.while_loop(on, again, start)
-    return x, positive | (left <= SMALL * dot(slope, first))  # at the end rounding may turn a curvature
+    whole = dot(slope, first)
+    start = (jnp.zeros_like(point.z), slope, slope, first, whole, jnp.zeros((), int), jnp.ones((), bool))
+    through, *_, left, _, positive = jax.lax.while_loop(on, again, start)
+    return through, positive | (left <= SMALL * whole)  # at the end rounding may turn a curvature
 
 
 def dot(a: States, b: States) -> jax.Array:

@@ -252,7 +252,8 @@ def between(a: Any, b: Any, share: Any) -> Any:
     return jax.tree.map(lambda p, q: jnp.where(share == 0, p, p + share * (q - p)), a, b)
 
 
-@jax.jit
 def chosen(first: jax.Array, one: Any, other: Any) -> Any:
     """One pytree or the other."""
+    if library(first) is np:
+        return one if first else other
     return jax.tree.map(lambda a, b: jnp.where(first, a, b), one, other)

@@ -75,13 +75,14 @@ def _iterate(model: Model, prior: Prior, given: Given, state: State, rule: str, 
     steps = FEW if few else STEPS if prior.proper else UNHELD
     known = state.carry or None
     mode, solved = _climb(model, state.point, now, steps, 1e-2 * given.tolerance, trajectory, known)
-    return _settled(model, prior, given, state._replace(carry=() if known is None else solved), mode, solved)
+    found = laplace_of(model, mode.point, solved, now)
+    return _settled(model, prior, given, state._replace(carry=() if known is None else solved, found=found), mode)
 
 
 @partial(jax.jit, static_argnames="prior")
-def _settled(model: Model, prior: Prior, given: Given, state: State, mode: Mode, solved: Eliminated) -> State:
-    """The state at a mode, with the evidence there."""
-    found = laplace_of(model, mode.point, solved, given.prior._replace(alpha=state.alpha))
+def _settled(model: Model, prior: Prior, given: Given, state: State, mode: Mode) -> State:
+    """The state at a mode, with what was found there."""
+    found = state.found
     objective = (
         found.evidence if prior.proper or not prior.learns else _density(model, prior, given, mode.point) - mode.volume
     )
@@ -92,7 +93,7 @@ def _settled(model: Model, prior: Prior, given: Given, state: State, mode: Mode,
     done = nothing | (mode.converged & still if learns else mode.converged)
     done = done | jnp.any(astray(prior, mode.point.z, given.surveyed))  # it diverged: no further step helps
     refused = state.refused & mode.refused
-    state = state._replace(point=mode.point, found=found, objective=objective, refused=refused, done=done)
+    state = state._replace(point=mode.point, objective=objective, refused=refused, done=done)
     return valued(prior, given, state)
 
 

@@ -11,7 +11,7 @@ from probcal.errors import FitError
 from probcal.gaussian.choose import choose
 from probcal.gaussian.draws import residuals
 from probcal.gaussian.engine import Expansion, Factors, told_alone
-from probcal.gaussian.information import growing_square, mean_square, rejected, squares_of
+from probcal.gaussian.information import growing_square, mean_square, rejected
 from probcal.gaussian.mode import Point
 from probcal.inference.integrate import Integrated, Integration
 from probcal.inference.loop import Trace
@@ -168,7 +168,7 @@ def misfit_sentence(problem: Problem, point: Point, square: float | None = None)
     Empty where the point explains the data, and robust noise rejects no sensor. A std that grows hides a
     misfit: then the automatic start is compared.
     """
-    square = float(mean_square(problem.model, point)) if square is None else square
+    square = mean_square(problem.model, point) if square is None else square
     grown = growing_square(problem.model, point)
     if square <= ABSURD and grown > DOUBTED and choose(problem.model).cheap and not _drawn(problem):
         least = growing_square(problem.model, automatic_start(problem))
@@ -207,7 +207,7 @@ def _remains(problem: Problem, point: Point) -> MisfitData:
     }
     sensor, channel, target = (np.asarray(names[name], str) for name in ("sensor", "channel", "target"))
     return MisfitData(
-        square=gather(squares_of(problem.model, point), picks),
+        square=gather(residuals(problem.model, point).square, picks),
         residual=gather(residuals(problem.model, point).innovation, picks),
         value=datum["y"],
         sensor=sensor,

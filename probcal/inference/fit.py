@@ -7,7 +7,6 @@ from functools import partial
 from os import PathLike
 from typing import TYPE_CHECKING
 
-import jax
 import numpy as np
 
 from probcal.gaussian.mode import Point
@@ -20,7 +19,7 @@ from probcal.inference.solve import solve
 from probcal.priors import AnyPrior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
-from probcal.simulate import Key, as_key
+from probcal.simulate import Key, as_key, derived_keys
 from probcal.types import float64
 
 if TYPE_CHECKING:
@@ -86,7 +85,7 @@ def calibrate(
 ) -> tuple[xr.DataTree, Answer]:  # fmt: skip
     """The tree of `fit`, and the answer behind it, which the loops over many fits read."""
     (default, _), (fallback, _) = METHODS["ea"], METHODS["nuts"]
-    method, monitor, keys = default if method is None else method, monitor or Monitor(), jax.random.split(as_key(key))
+    method, monitor, keys = default if method is None else method, monitor or Monitor(), derived_keys(as_key(key))
     chosen = choose_prior(method, prior, problem.network.labels)
     check_problem(problem, linear=not method.by_particles)
     if problem.scans is not None:

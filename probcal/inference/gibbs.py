@@ -46,10 +46,9 @@ def gibbs_sweep(
         return theta, kind.updates()[k](phi, theta[learnt], key)
 
     def biases(theta: jax.Array, phi: Phi, key: jax.Array) -> tuple[jax.Array, Phi]:
-        keys = jax.random.split(key)
         if kind.spiked:
-            phi = update_inclusions(form, posed, phi, keys[0], backwards=backwards)
-        return draw_given(form, posed, phi, keys[1]), phi
+            phi = update_inclusions(form, posed, phi, jax.random.fold_in(key, 1), backwards=backwards)
+        return draw_given(form, posed, phi, key), phi
 
     steps: list[Any] = [lambda t, p, s, k=k: hyper(k, t, p, s) for k in range(len(kind.updates()))] + [biases]
     for step, own in zip(steps[::-1] if backwards else steps, jax.random.split(key, len(steps)), strict=True):

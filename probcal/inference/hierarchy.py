@@ -21,8 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.inference.draws import inverse_gaussian, slice_step
-from probcal.labels import AXES
+from probcal.inference.draws import inverse_gaussian, normals, slice_step, uniforms
 from probcal.lazy import Later
 from probcal.priors import ARD, BernoulliGaussian, Flat, Gaussian, Horseshoe, Laplace, Prior
 from probcal.problem import Problem
@@ -113,9 +112,13 @@ class Hierarchy(ABC):
         keys = jax.random.split(key, len(drawn) + 1)
         return {name: one(k) for (name, one), k in zip(drawn.items(), keys, strict=False)}
 
-    def begin(self, key: jax.Array) -> Phi:
-        """Where a chain on a Gaussian likelihood starts: a draw from the prior, unless said otherwise."""
-        return self.draw(key)
+    def begin(self, chains: int) -> dict[str, np.ndarray]:
+        """Far starts of chains on a Gaussian likelihood: each has one level of all its hyper-parameters, in scales."""
+        levels, shapes = np.geomspace(0.03, 0.97, chains), jax.eval_shape(lambda: self.draw(jax.random.key(0)))
+        return {
+            name: np.moveaxis(np.full((*own.shape, chains), levels), -1, 0).astype(own.dtype)
+            for name, own in shapes.items()
+        }
 
     def log_prior(self, phi: Phi) -> jax.Array:
         """Log density of the hyper-parameters."""
@@ -271,13 +274,6 @@ class RegularisedHorseshoe(Hierarchy):
             "slab_variance": lambda key: half * self.prior.slab_scale**2 / jax.random.gamma(key, half),
         }
 
-    def begin(self, key):
-        """Scales from their prior, the slab as declared: its Gamma variable would take a second to compile."""
-        drawn, keys = self.drawn(), jax.random.split(key)
-        names = ("local_scale", "global_scale")
-        scales = {name: drawn[name](k) for name, k in zip(names, keys, strict=True)}
-        return scales | {"slab_variance": jnp.full((), self.prior.slab_scale**2, float)}
-
     def governed(self, phi):
         """Slab and shrinkage added."""
         local = phi["local_scale"][jnp.asarray(self.group)]
@@ -293,28 +289,26 @@ class RegularisedHorseshoe(Hierarchy):
         def total(z: jax.Array) -> jax.Array:
             return jnp.zeros(self.count).at[group].add(z**2)
 
-        def standard_gamma(key: jax.Array) -> jax.Array:
-            """Gamma draws of shape (members + 1) / 2, of one member an exponential.
+        def standard_gamma(alone: jax.Array, key: jax.Array) -> jax.Array:
+            """Gamma draws of shape (members + 1) / 2, of one member the exponential `alone`.
 
-            Those of the axes of a vector are halves of chi-squares: the sampler of jax would take a
-            second to compile.
+            They are halves of chi-squares: the sampler of jax would take a second to compile.
             """
             if (members == 1).all():
-                return jax.random.exponential(key, (self.count,))
-            if members.max(initial=0) > len(AXES):
-                return jax.random.gamma(key, 0.5 * (jnp.asarray(members) + 1.0))
-            squares = jax.random.normal(key, (self.count, len(AXES) + 1)) ** 2
-            return 0.5 * jnp.sum(jnp.where(np.arange(len(AXES) + 1) <= members[:, None], squares, 0.0), 1)
+                return alone
+            number = np.arange(members.max(initial=0) + 1)
+            squares = normals(key, (self.count, len(number))) ** 2
+            return 0.5 * jnp.sum(jnp.where(number <= members[:, None], squares, 0.0), 1)
 
         def local(phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
-            keys = jax.random.split(key, 3)
             square, tau2 = phi["local_scale"] ** 2, phi["global_scale"] ** 2
-            auxiliary = (1.0 + 1.0 / square) / jax.random.exponential(keys[0], square.shape)
-            proposal = (1.0 / auxiliary + 0.5 * total(z) / tau2) / standard_gamma(keys[1])
+            drawn = -jnp.log1p(-uniforms(key, (3, self.count)))  # exponential
+            auxiliary = (1.0 + 1.0 / square) / drawn[0]
+            proposal = (1.0 / auxiliary + 0.5 * total(z) / tau2) / standard_gamma(drawn[1], jax.random.fold_in(key, 1))
             ratio = 0.5 * (
                 jnp.log1p(tau2 * proposal / phi["slab_variance"]) - jnp.log1p(tau2 * square / phi["slab_variance"])
             )
-            taken = jnp.log(jax.random.uniform(keys[2], square.shape)) < jnp.asarray(members) * ratio
+            taken = -drawn[2] < jnp.asarray(members) * ratio
             return phi | {"local_scale": jnp.sqrt(jnp.where(taken, proposal, square))}
 
         def density(z: jax.Array, local: jax.Array, logs: jax.Array) -> jax.Array:
@@ -491,11 +485,6 @@ class Product(Hierarchy):
         """From the prior of every part."""
         keys = jax.random.split(key, len(self.pieces))
         return self._joined([one.draw(own) for (_, one), own in zip(self.pieces, keys, strict=True)])
-
-    def begin(self, key):
-        """Starting values of every part."""
-        keys = jax.random.split(key, len(self.pieces))
-        return self._joined([one.begin(own) for (_, one), own in zip(self.pieces, keys, strict=True)])
 
     def updates(self):
         """Those of every part, given its own biases."""

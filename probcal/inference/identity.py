@@ -9,7 +9,6 @@ from os import PathLike
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from probcal.fingerprint import ADDRESS, computes
@@ -113,7 +112,7 @@ def _code(block: Block, rows: Rows, levels: int) -> str:
             log_likelihood(block, rows, predicted, levels), weights, information(block, rows, predicted, levels)
         )  # fmt: skip
 
-    return block.type.fingerprint + computes(noise, rows, rows.y, jnp.zeros(levels))
+    return block.type.fingerprint + computes(noise, rows, rows.y, np.zeros(levels))
 
 
 def add_array(found: Any, value: Any) -> None:

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import ndtr
 
 from probcal import linalg
 from probcal.gaussian.choose import engine_of
@@ -26,7 +25,7 @@ from probcal.gaussian.search import chosen
 from probcal.inference.gibbs import gibbs_sweep
 from probcal.inference.hierarchy import Phi
 from probcal.inference.method import Context
-from probcal.inference.posed import Form, Natural, activity, draw_given, prior_precision
+from probcal.inference.posed import Form, Natural, natural
 from probcal.inference.propagate import BiasLikelihood, Propagation
 from probcal.model.model import Model
 from probcal.priors import Precision
@@ -93,17 +92,17 @@ def integrate(
         engine = engine_of("dense", model)
         return by_propagation(how.form, first, engine, engine.at(model, start), Context(key), marginal=how.marginal)[0]
     known, _ = likelihood(how, model, first, start)
-    chains, point = begin(how.form, known, jax.random.fold_in(key, 0)), start
+    chains, point = begin(how.form), start
     for turn in range(MOVES if search else 1):
-        chains, swept = run_sweeps(how.form, known, chains, jax.random.fold_in(key, turn + 2), FIRST, BURN)
+        chains, swept = run_sweeps(how.form, known, chains, key, FIRST, BURN, turn * (BURN + KEPT))
         before = point.z
         point, known = recentred(how, model, point, known, swept.mean)
-        moved = (np.asarray(point.z) - before) / np.maximum(swept.spread, 1e-9) if search else np.zeros(0)
+        moved = np.subtract(point.z, before) / np.maximum(swept.spread, 1e-9) if search else np.zeros(0)
         if search and np.max(np.abs(moved), initial=0.0) < NEAR:
             break
     if search:
-        return _by_batches(how.form, model, point, known, chains, jax.random.fold_in(key, 1))
-    _, swept = run_sweeps(how.form, known, chains, jax.random.fold_in(key, 1), KEPT)
+        return _by_batches(how.form, model, point, known, chains, key)
+    _, swept = run_sweeps(how.form, known, chains, key, KEPT, BURN, BURN + KEPT)
     total = moments(how.form, known, swept.phi)
     return Integrated(point_at(model, point, total.mean), known.information, total, swept.z, swept.phi)
 
@@ -112,7 +111,7 @@ def _by_batches(form: Form, model: Model, point: Point, known: Natural, chains: 
     """The mixture of batches of sweeps, taken until their means and sds agree, and its draws from all of them."""
     most, kept, found = int(np.clip(WORK // max(form.biases, 1) ** 2, 2, BATCHES)), list[Any](), list[Moments]()
     for k in range(most):
-        chains, swept = run_sweeps(form, known, chains, jax.random.fold_in(key, k), KEPT, 0 if k else BURN)
+        chains, swept = run_sweeps(form, known, chains, key, KEPT, 0 if k else BURN, (MOVES + k) * (BURN + KEPT))
         kept.append(jax.device_get((swept.z, swept.phi)))
         found.append(jax.device_get(moments(form, known, swept.phi)))
         total, mean_error, sd_error = pooled(found)
@@ -212,15 +211,9 @@ def recentred(how: Integration, model: Model, point: Point, known: Natural, mean
     return chosen(sound, (moved, after), (point, known))
 
 
-@partial(jax.jit, static_argnames="form")
-def begin(form: Form, known: Natural, key: jax.Array) -> tuple[jax.Array, Phi]:
-    """Biases and hyper-parameters that each chain starts from: drawn from the prior, so further out than the data."""
-
-    def one(own: jax.Array) -> tuple[jax.Array, Phi]:
-        phi = form.hierarchy.begin(own)
-        return draw_given(form, known, phi, jax.random.fold_in(own, 1)), phi
-
-    return jax.lax.map(one, jax.random.split(key, CHAINS))
+def begin(form: Form) -> tuple[Any, Any]:
+    """Biases, which the first sweep draws, and hyper-parameters that each chain starts from: far apart."""
+    return np.zeros((CHAINS, form.biases)), form.hierarchy.begin(CHAINS)
 
 
 class Swept(NamedTuple):
@@ -234,20 +227,23 @@ class Swept(NamedTuple):
 
 @partial(jax.jit, static_argnames="form")
 def run_sweeps(
-    form: Form, known: Natural, chains: Any, key: jax.Array, count: int, burn: int = BURN
+    form: Form, known: Natural, chains: Any, key: jax.Array, count: int, burn: int = BURN, before: int = 0
 ) -> tuple[Any, Swept]:
-    """`count` sweeps of every chain from where it stands, after `burn` others; also where the chains end."""
+    """`count` sweeps of every chain from where it stands, after `burn` others; also where the chains end.
+
+    `before` is the number of those that have used the key."""
 
     def chain(pair: tuple[Any, jax.Array]) -> tuple[Any, Any]:
         def one(k: jax.Array, state: Any) -> Any:
             (theta, phi), drawn = state
-            at = gibbs_sweep(form, known, theta, phi, jax.random.fold_in(pair[1], k), backwards=False)
+            own = jax.random.fold_in(key, CHAINS * (before + k) + pair[1])
+            at = gibbs_sweep(form, known, theta, phi, own, backwards=True)
             return at, jax.tree.map(lambda kept, leaf: kept.at[jnp.maximum(k - burn, 0)].set(leaf), drawn, at)
 
         blank = jax.tree.map(lambda leaf: jnp.zeros((KEPT, *leaf.shape), leaf.dtype), pair[0])
         return jax.lax.fori_loop(0, burn + count, one, (pair[0], blank))
 
-    ends, (z, phi) = jax.lax.map(chain, (chains, jax.random.split(key, CHAINS)))
+    ends, (z, phi) = jax.lax.map(chain, (chains, jnp.arange(CHAINS)))
     mean, square = jnp.sum(z, (0, 1)) / (CHAINS * count), jnp.sum(z**2, (0, 1)) / (CHAINS * count)
     return ends, Swept(z, phi, mean, jnp.sqrt(jnp.maximum(square - mean**2, 0.0)))
 
@@ -257,23 +253,17 @@ def moments(form: Form, known: Natural, phi: Phi) -> Moments:
     """Mean, covariance, interval and gamma of the mixture of the Gaussians that hyper-parameters leave (thinned)."""
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[::EVERY], phi)
 
-    def one(phi: Phi) -> tuple[jax.Array, jax.Array, jax.Array]:
-        alpha, coupling = prior_precision(form, known, phi)
-        active = activity(form, known, phi)
-        both = active[:, None] & active[None, :]
-        matrix = jnp.where(both, known.information + coupling + jnp.diag(alpha), jnp.eye(form.biases))
-        covariance = jnp.where(both, linalg.inverse_and_logdet(matrix)[0], 0.0)
-        gamma = jnp.where(active, jnp.clip(1.0 - alpha * jnp.diagonal(covariance), 0.0, 1.0), 0.0)
-        return covariance @ known.pull, covariance, gamma
-
     def add(total: jax.Array, own: Phi) -> tuple[jax.Array, Any]:
-        mean, covariance, gamma = one(own)
-        return total + covariance, (mean, jnp.diagonal(covariance), gamma)
+        matrix, pull, active, alpha = natural(form, known, own)
+        inverse, _ = linalg.inverse_and_logdet(matrix)
+        covariance = jnp.where(active[:, None] & active[None, :], inverse, 0.0)
+        variance = jnp.maximum(jnp.diagonal(covariance), 0.0)
+        gamma = jnp.where(active, jnp.clip(1.0 - alpha * variance, 0.0, 1.0), 0.0)
+        return total + covariance, (covariance @ pull, jnp.sqrt(variance), gamma)
 
-    total, (means, variances, gammas) = jax.lax.scan(add, jnp.zeros((form.biases, form.biases)), flat)
+    total, (means, sds, gammas) = jax.lax.scan(add, jnp.zeros((form.biases, form.biases)), flat)
     count, mean = means.shape[0], jnp.mean(means, 0)
     covariance = total / count + jnp.cov(means, rowvar=False, bias=True).reshape(total.shape)
-    sds = jnp.sqrt(jnp.maximum(variances, 0.0))
     lower, upper = interval(means, sds)
     return Moments(mean, covariance, lower, upper, jnp.mean(gammas, 0))
 
@@ -284,13 +274,12 @@ def interval(means: jax.Array, sds: jax.Array) -> jax.Array:
 
     By halving a bracket; an atom counts.
     """
-    width, tail = 10.0 * jnp.max(sds, 0) + 1e-12, 0.5 * (1.0 - INTERVAL)
-    shares = jnp.array([tail, 1.0 - tail])
+    width, shares = 10.0 * jnp.max(sds, 0) + 1e-12, jnp.array([-INTERVAL, INTERVAL])
 
     def half(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         low, high = ends
         at = 0.5 * (low + high)
-        inside = ndtr((at[:, None] - means[None]) / jnp.maximum(sds, 1e-12)[None])
+        inside = jax.lax.erf((at[:, None] - means[None]) / (jnp.sqrt(2.0) * jnp.maximum(sds, 1e-12))[None])
         below = jnp.mean(inside, 1) < shares[:, None]
         return jnp.where(below, at, low), jnp.where(below, high, at)
 

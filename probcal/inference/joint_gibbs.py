@@ -119,14 +119,14 @@ class GibbsChains(Chains):
 
     def begun(self) -> SweepState:
         """Chains at draws under the declared scales; the reference at the mean of sweeps on the Gaussian."""
-        M, begin, C = self.form.biases, self.form.hierarchy.begin, self.method.chains
+        M, C = self.form.biases, self.method.chains
         key, drawn = jax.random.fold_in(self.key, 1), jax.random.fold_in(self.key, 0)
         reference = self._at(variables_of(self.mode.point.states, self.mode.point.z))
         scales = np.ones(M) if self.form.hierarchy.learnt else np.asarray(self.first.alpha)
         wide = SplitGaussian.of(reference, scales, self.coupled)
         at = wide.mean[None] + np.stack([wide.deviation(jax.random.fold_in(drawn, c)) for c in range(C)])
-        phis = [begin(jax.random.fold_in(key, c)) for c in range(C)]
-        phi = phis[0]
+        phis = self.form.hierarchy.begin(C)
+        phi = jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), phis)
         if self.form.hierarchy.learnt:
             z, total = at[0, -M:], np.zeros(M)
             for k in range(PILOT):
@@ -141,8 +141,7 @@ class GibbsChains(Chains):
         here = given.mean + given.deviation(jax.random.fold_in(drawn, C + PILOT))
         tried = _Chain(0, 0, here, np.asarray(self.mode.point.levels), phi, reference, reference.rest(here)[0], 0.0)
         kicks = self._kicks(tried, jax.random.fold_in(drawn, C + PILOT + 1))
-        stacked = {name: np.stack([np.asarray(phi[name]) for phi in phis]) for name in phis[0]}
-        return self._begun(at, stacked, reference.variables, kicks)
+        return self._begun(at, phis, reference.variables, kicks)
 
     def _begun(self, at: np.ndarray, phi: Any, reference: np.ndarray, kicks: int) -> SweepState:
         M, S = self.form.biases, self.model.state_size

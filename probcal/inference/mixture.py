@@ -33,6 +33,7 @@ from probcal.results.answer import (
 )
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import ROPE
+from probcal.simulate import derived_keys
 
 
 def gaussian(
@@ -104,7 +105,7 @@ def gaussian_biases(own: Posterior, key: jax.Array) -> np.ndarray:
 
 def draw_gaussian(own: Posterior, key: jax.Array, keep: tuple[str, ...]) -> Draws:
     """Independent draws of a Gaussian, as many as the size of the data lets be kept."""
-    keys = jax.random.split(key)
+    keys = derived_keys(key)
     return draw_along(own, keys[1], keep, gaussian_biases(own, keys[0]))
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from probcal import linalg
 from probcal.gaussian.frame import Frame
+from probcal.inference.draws import normals
 from probcal.inference.hierarchy import Hierarchy, Phi
 from probcal.model.model import Model
 from probcal.priors import Precision
@@ -140,7 +141,7 @@ def conditional(form: Form, posed: Quadratic, phi: Phi) -> Conditional:
 def draw_given(form: Form, posed: Quadratic, phi: Phi, key: jax.Array) -> jax.Array:
     """One draw (Q,) of theta given phi: that of `conditional`, without the inverse."""
     matrix, pull, active, _ = natural(form, posed, phi)
-    return jnp.where(active, linalg.displace(matrix, pull, jax.random.normal(key, pull.shape)), 0.0)
+    return jnp.where(active, linalg.displace(matrix, pull, normals(key, pull.shape)), 0.0)
 
 
 def log_prior(form: Form, posed: Quadratic, theta: jax.Array, phi: Phi) -> jax.Array:

@@ -238,7 +238,7 @@ class Propagation(Task):
         """The beginning: biases of their declared scales."""
         precision = np.eye(members.shape[1])[None] * np.isin(members, form.hierarchy.learnt)[:, :, None]
         sites, none = Blocks(precision, np.zeros(members.shape)), np.zeros(0)
-        chain = BlockChain(jnp.asarray(none), form.hierarchy.begin(jax.random.fold_in(key, 0)))
+        chain = BlockChain(jnp.asarray(none), jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), form.hierarchy.begin(2)))
         swept = BlocksSwept(*[none] * 5)
         return cls(form, first, likelihood, members, key, sites, sites, chain, swept, none)
 

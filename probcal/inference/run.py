@@ -30,6 +30,7 @@ from probcal.inference.integrate import Integration, integrate
 from probcal.inference.loop import Pause, Trace
 from probcal.inference.method import Context, Given, Iterated, MethodTask, State
 from probcal.inference.placed import Reached, with_places
+from probcal.linalg import library
 from probcal.model.model import Model
 from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Gaussian, Precision, Prior
 from probcal.priors import Laplace as LaplacePrior
@@ -302,4 +303,5 @@ def course_of(state: State) -> Trace:
 def stepped(method: Any, model: Model, prior: Prior, given: Given, state: State) -> State:
     """One outer iteration at the precisions of the process noise that a state has; two without an objective end it."""
     after: State = method.iterate(model.with_mixing(state.mixing), prior, given, state)
-    return after._replace(done=after.done | (jnp.isnan(after.objective) & jnp.isnan(state.objective)))
+    lib = library(after.objective)
+    return after._replace(done=lib.logical_or(after.done, lib.isnan(after.objective) & lib.isnan(state.objective)))

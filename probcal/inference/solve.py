@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
-import jax
 import numpy as np
 
 from probcal.errors import FitError, InputError
@@ -25,6 +24,7 @@ from probcal.modes.mirrors import other_sides
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
+from probcal.simulate import derived_keys
 from probcal.wings import of_wing
 
 STILL = 0.1  # sd by which no clock moves at the end of them
@@ -92,7 +92,7 @@ def solve_timed(
     if method.engined:
         return _sampled_on_best_side(problem, method, prior, points[0], context)
     if not (monitor.stopped or large):
-        points += further_starts(problem, starts - len(points), jax.random.fold_in(context.key, 1))
+        points += further_starts(problem, starts - len(points), derived_keys(context.key, [1])[0])
     climber, own = (method, prior) if method.climbs else (MAP(trajectory="joint", engine="dense"), Gaussian())
     optima, unseen = list[Answer](), ""
     if method.climbs or len(points) > 1 or problem.levels or problem.model.tailed:

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from probcal.linalg import library
 from probcal.model import rows as waist
 from probcal.model.epochs import Epoch, Stepwise, merged, most_rows
 from probcal.model.rows import Block, Linearised, Rows
@@ -530,7 +531,7 @@ class Model(Stepwise):
 
     def weighted(self, weights: Sequence[Any]) -> "Model":
         """Every datum counted by a weight (N, C) or (N, 1): 0 leaves it out, a share is soft association."""
-        return self.with_rows(lambda data, w: {"mask": data.mask * jnp.asarray(w)}, weights)
+        return self.with_rows(lambda data, w: {"mask": library(data.mask, w).multiply(data.mask, w)}, weights)
 
     def with_rows(self, changes: Callable[..., dict[str, Any]], *of_each: Iterable[Any]) -> "Model":
         """The model whose rows of each block have the fields `changes(rows, *own)`.

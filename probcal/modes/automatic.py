@@ -107,7 +107,7 @@ def further_starts(problem: Problem, count: int, key: jax.Array) -> list[Point]:
 def polished(problem: Problem, start: Point, iterations: int = 30) -> Optimum:
     """The joint mode at the declared scales next to a start, by that with growing stds at the measured values."""
     model = problem.model
-    scales = Precision(jnp.ones(model.biases))
+    scales = Precision(jax.device_put(np.ones(model.biases)))
     if (measured := variants.at_measured(model)) is not model:
         start = find_mode(measured, start, scales, iterations, 1e-3).point
     mode = find_mode(model, start, scales, iterations, 1e-3)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from probcal.gaussian.choose import choose
-from probcal.gaussian.information import squares_of
+from probcal.gaussian.draws import residuals
 from probcal.gaussian.mode import Point
 from probcal.modes.automatic import Optimum, polished
 from probcal.modes.grid import follow_states, grid_start
@@ -88,7 +88,7 @@ def _moved(best: Optimum, m: int, value: float) -> Optimum:
 def _worst(best: Optimum, columns: list[int], tried: set[int]) -> int | None:
     """The bias of the clock, of those not tried, whose rows are explained worst; None where all are explained."""
     problem, model, total = best.problem, best.problem.model, dict[str, list[float]]()
-    for block, data, _, square, index in model.each_block(squares_of(model, best.point), problem.row_index):
+    for block, data, _, square, index in model.each_block(residuals(model, best.point).square, problem.row_index):
         owners = np.array([problem.network.sensors[k].nodes[0].name for k in problem.measurements.sensor[index]])
         if block.type.clocked:
             for name in dict.fromkeys(owners):

@@ -12,7 +12,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError
@@ -77,7 +76,7 @@ class SideClimb(NamedTuple):
         Where log determinants are estimated the log marginal density weighs it: of reflected biases they are nearly
         the same, and their errors would blur what tells the sides apart.
         """
-        model, scales = problem.model, Precision(jnp.ones(problem.model.biases))
+        model, scales = problem.model, Precision(jax.device_put(np.ones(problem.model.biases)))
         factors = Factors.of(scales)
 
         def joint(point: Point) -> tuple[Point, float]:

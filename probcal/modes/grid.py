@@ -200,8 +200,9 @@ def project(problem: Problem, tracks: list[np.ndarray], precision: list[np.ndarr
 
 
 def follow_states(problem: Problem, states: list[np.ndarray]) -> Point:
-    """Point at zero biases whose trajectories follow given states (E, n) of each recursion closely."""
-    return project(problem, states, [np.full_like(x, CLOSE) for x in states])
+    """Point at zero biases whose trajectories follow states (E, n) of each recursion closely, in what rows read."""
+    read = (np.isin(np.arange(x.shape[1]), problem.model.entries(r)) for r, x in enumerate(states))
+    return project(problem, states, [np.full(x.shape, CLOSE * own) for x, own in zip(states, read, strict=True)])
 
 
 def grid_start(problem: Problem, z: Any = None, iterations: int = 30) -> Point:

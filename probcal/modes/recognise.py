@@ -76,7 +76,7 @@ def _tried(kind: SensorType, d: int) -> dict[str, Kind]:
     look = jax.jit(jax.vmap(one, (0, 0, 0, None, None)))
 
     def at(level: float, biases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        value, shape = look(*(jnp.asarray(x, float) for x in (place, nodes, turned, level, biases)))
+        value, shape = look(*(np.asarray(x, float) for x in (place, nodes, turned, level, biases)))
         return np.asarray(value), np.asarray(shape)
 
     rest = np.zeros(len(names))

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.gaussian.information import squares_of
+from probcal.gaussian.draws import residuals
 from probcal.modes import automatic_start
 from probcal.modes.grid import track_mode
 from probcal.problem import Problem
@@ -42,7 +42,7 @@ def _left(problem: Problem) -> float:
     point = track_mode(problem, uncalibrated(problem, automatic_start(problem)))
     squares = [
         np.asarray(part)[np.asarray(there) > 0]
-        for part, there in zip(squares_of(problem.model, point), problem.model.measured, strict=True)
+        for part, there in zip(residuals(problem.model, point).square, problem.model.measured, strict=True)
     ]
     return float(np.mean(np.nan_to_num(np.minimum(np.concatenate(squares), LARGE), nan=LARGE)))
 

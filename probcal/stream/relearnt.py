@@ -35,8 +35,7 @@ def relearnt(problem: Problem, prior: Prior, held: Precision, mean: np.ndarray, 
         raise InputError(f"under({type(prior).__name__}()): give a prior with precisions, Horseshoe() or ARD()")
     form = Form(problem.model.biases, hierarchy_of(prior, problem))
     known = Natural(jnp.asarray(information), jnp.asarray(pull), jnp.zeros(0), first)
-    keys = jax.random.split(jax.random.key(key))
-    _, swept = run_sweeps(form, known, begin(form, known, keys[0]), keys[1], KEPT)
+    _, swept = run_sweeps(form, known, begin(form), jax.random.key(key), KEPT)
     return Moments(*(np.asarray(part) for part in moments(form, known, swept.phi)))
 
 
