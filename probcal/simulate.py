@@ -41,7 +41,7 @@ def as_key(key: Key) -> jax.Array:
 
 @np.errstate(over="ignore")  # sums modulo 2**32
 def derived_keys(key: jax.Array, numbers: Sequence[int] = (0, 1)) -> list[jax.Array]:
-    """The keys that `jax.random.split` makes of a key and each number, on the host (Threefry, Salmon et al. 2011)."""
+    """Keys of a key and numbers as `jax.random.split` makes them, on the host (Salmon et al. 2011)."""
     first, second = np.asarray(jax.random.key_data(key))
     words = 3 * (first, second, first ^ second ^ np.uint32(0x1BD11BDA))
     low = np.array(numbers, np.uint32) + second

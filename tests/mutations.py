@@ -87,7 +87,7 @@ MUTATIONS = [
     Mutation("return proposal, 0.5 * slope", "return proposal, slope", "test_guards.py"),
     Mutation("~moved & ~converged", "moved & ~converged", "test_guards.py"),
     # gaussian/marginal.py
-    Mutation("slope = own + jax.grad(along)(point.z)", "slope = own", "test_marginal.py"),
+    Mutation("slope = own + through", "slope = own", "test_marginal.py"),
     Mutation("tuple(-own - jnp.einsum(", "tuple(0 * own - 0 * jnp.einsum(", "test_marginal.py"),
     # gaussian/climb.py
     Mutation("self.prior.pull(at.point.z) - 0.5 * volume", "self.prior.pull(at.point.z) + 0.5 * volume", "test_marginal.py"),
@@ -115,7 +115,7 @@ MUTATIONS = [
     Mutation("change / (1.0 + change * row[m])", "change / (1.0 - change * row[m])", "test_relevance.py"),
     # inference/integrate.py, propagate.py
     Mutation("solved.information @ z + score", "solved.information @ z - score", "test_integrate.py"),
-    Mutation("clip(1.0 - alpha * jnp.diagonal(covariance)", "clip(1.0 - jnp.diagonal(covariance)", "test_integrate.py"),
+    Mutation("jnp.clip(1.0 - alpha * variance, 0.0, 1.0), 0.0)\n        return total", "jnp.clip(1.0 - variance, 0.0, 1.0), 0.0)\n        return total", "test_integrate.py"),
     Mutation("total / count + jnp.cov(", "total / count + 0 * jnp.cov(", "test_integrate.py"),
     Mutation("without_negative(precision - self.sites.precision, LEAST)", "without_negative(precision, LEAST)", "test_integrate.py"),
     Mutation("middle) - self.sites.pull\n", "middle)\n", "test_integrate.py"),
@@ -130,7 +130,7 @@ MUTATIONS = [
     Mutation("jax.tree.map(jnp.add, alone,", "jax.tree.map(lambda a, b: b, alone,", "test_formulas.py"),
     Mutation("@ moved[epoch] + by_bias", "@ moved[epoch] - by_bias", "test_formulas.py test_observability.py"),
     Mutation("jnp.exp(point.levels - levels)", "jnp.exp(levels - point.levels)", "test_formulas.py"),
-    Mutation("(squares + point.trajectories.square)", "squares", "test_guards.py"),
+    Mutation("*map(np.square, point.noises)", "", "test_guards.py"),
     # gaussian/jointly.py
     Mutation("slopes.z - model.onto_biases(", "slopes.z + model.onto_biases(", "test_engine.py"),
     # gaussian/draws.py

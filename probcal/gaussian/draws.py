@@ -151,6 +151,6 @@ class Remainder(NamedTuple):
 
 @jax.jit
 def residuals(model: Model, point: Point) -> Remainder:
-    """What is left of every datum at a point."""
+    """Remainders of every datum at a point."""
     parts = model.innovation, model.spread_of_noise, model.reliance, model.square, model.log_likelihood
     return Remainder(*(part(point) for part in parts))

@@ -15,7 +15,7 @@ from probcal.gaussian.mode import Eliminated, Point, factors, log_likelihood
 from probcal.model.model import At, Model
 
 States = tuple[jax.Array, ...]  # (E, n) of each recursion
-ROUNDS, EXACT = 31, 1e-14  # of an adjoint solve at most, and the share of its first square that ends it
+ROUNDS, EXACT = 31, 1e-14  # of an adjoint solve at most; share of its first square that ends it
 SMALL = 1e-6  # share of its first square from which on an adjoint solve is good enough
 
 
@@ -27,8 +27,8 @@ def volume_slope(
 
     `only` (E,) of each recursion marks the epochs of the targets that count; all without it.
 
-    d log det W = sum over k of tr(P_k dJ_k), P_k the smoothed covariance of the states given z, J_k the sum of the
-    information of the rows of an epoch. The way through the
+    d log det W = sum over k of tr(P_k dJ_k), P_k the smoothed covariance of the states given z, J_k
+    the information of the rows of an epoch. The way through the
     trajectories is one adjoint smooth with the second derivatives of the density (see `_adjoint`). Where a target
     stands on a cusp, at the place of a sensor, there is none: the derivative is zero and the second value False.
     """
@@ -57,9 +57,10 @@ def volume_slope(
 def _adjoint(
     model: Model, point: Point, solved: Eliminated, spread: list[jax.Array], slope: States
 ) -> tuple[jax.Array, jax.Array]:
-    """How a slope by the states (E, n) reaches the biases through the trajectories: K x (M,), H x = slope.
+    """Slope by the biases through the trajectories, K x (M,), of a slope (E, n) by the states, H x.
 
-    H and K are the second derivatives of the negative log density by the trajectories, and by these and the biases.
+    H are the second derivatives of the negative log density by the trajectories, K minus those by
+    these and the biases.
     Smoothing, S, solves with the expected information in the place of the observed; `spread` are its covariances
     (E, n, n). With R what the two differ by, x = S y where (I + R S) y = slope: conjugate gradients in the inner
     product of S, one smooth each (Saad 2003, 6.7), of which K x is the sum.
@@ -73,7 +74,7 @@ def _adjoint(
     score = jax.grad(lambda x, z: log_likelihood(model, At(x, z, point.levels)), argnums=(0, 1))
 
     def observed(x: States) -> tuple[States, jax.Array]:
-        """What the observed information adds to the expected, times x, and minus K x."""
+        """What the observed information adds to the expected, times x, and K x."""
         by_state, by_bias = jax.jvp(lambda at: score(at, point.z), (point.states,), (x,))[1]
         parts = model.each_layout(solved.parts, by_state, x)
         return tuple(-own - jnp.einsum("eij,ej->ei", kept.J, v) for _, kept, own, v in parts), by_bias

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 WIDTH = 12.0  # first interval of a slice, in the units of its variable (a logarithm)
 SHRINKINGS = 40  # most places that it tries
-TOGETHER = 64  # uniform draws of which a kernel makes a multiple at once, so that one computation serves several calls
+TOGETHER = 64  # uniform draws are made in multiples: one computation serves several calls
 
 
 def uniforms(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
@@ -19,7 +19,7 @@ def uniforms(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 
 
 def normals(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Standard normal draws (Box and Muller 1958): a tenth of what the inverse distribution takes to compile."""
+    """Standard normal draws (Box and Muller 1958); those of jax take ten times as much to compile."""
     first, second = uniforms(key, (2, *shape))
     return jnp.sqrt(-2.0 * jnp.log1p(-first)) * jnp.cos(2.0 * jnp.pi * second)
 
@@ -40,7 +40,7 @@ def slice_step(key: jax.Array, x: jax.Array, density: Callable[[jax.Array], jax.
     draws = uniforms(key, (SHRINKINGS + 2, *x.shape))
 
     def shrink(state: Any) -> Any:
-        """The density at the next place; that of the first turn is x, which gives the level of the slice."""
+        """The density at the next place; at the first, x, it gives the level of the slice."""
         low, high, k, level, at, _ = state
         value = density(at)
         level = jnp.where(k == 0, value + jnp.log1p(-draws[0]), level)

@@ -82,9 +82,10 @@ def _iterate(model: Model, prior: Prior, given: Given, state: State, rule: str, 
 @partial(jax.jit, static_argnames="prior")
 def _settled(model: Model, prior: Prior, given: Given, state: State, mode: Mode) -> State:
     """The state at a mode, with what was found there."""
-    found = state.found
     objective = (
-        found.evidence if prior.proper or not prior.learns else _density(model, prior, given, mode.point) - mode.volume
+        state.found.evidence
+        if prior.proper or not prior.learns
+        else _density(model, prior, given, mode.point) - mode.volume
     )
     still = jnp.abs(objective - state.objective) < given.tolerance
     # on a cusp, where a target grazes a sensor, and where rounding hides what is left, no step lowers the cost

@@ -113,7 +113,7 @@ class Hierarchy(ABC):
         return {name: one(k) for (name, one), k in zip(drawn.items(), keys, strict=False)}
 
     def begin(self, chains: int) -> dict[str, np.ndarray]:
-        """Far starts of chains on a Gaussian likelihood: each has one level of all its hyper-parameters, in scales."""
+        """Far starts of chains on a Gaussian likelihood: one level of all hyper-parameters of each."""
         levels, shapes = np.geomspace(0.03, 0.97, chains), jax.eval_shape(lambda: self.draw(jax.random.key(0)))
         return {
             name: np.moveaxis(np.full((*own.shape, chains), levels), -1, 0).astype(own.dtype)

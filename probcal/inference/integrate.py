@@ -212,7 +212,7 @@ def recentred(how: Integration, model: Model, point: Point, known: Natural, mean
 
 
 def begin(form: Form) -> tuple[Any, Any]:
-    """Biases, which the first sweep draws, and hyper-parameters that each chain starts from: far apart."""
+    """Biases, which the first sweep draws, and far starts of the hyper-parameters of each chain."""
     return np.zeros((CHAINS, form.biases)), form.hierarchy.begin(CHAINS)
 
 
@@ -229,7 +229,7 @@ class Swept(NamedTuple):
 def run_sweeps(
     form: Form, known: Natural, chains: Any, key: jax.Array, count: int, burn: int = BURN, before: int = 0
 ) -> tuple[Any, Swept]:
-    """`count` sweeps of every chain from where it stands, after `burn` others; also where the chains end.
+    """`count` sweeps of every chain from its state, after `burn` others; also the last states.
 
     `before` is the number of those that have used the key."""
 
@@ -255,8 +255,8 @@ def moments(form: Form, known: Natural, phi: Phi) -> Moments:
 
     def add(total: jax.Array, own: Phi) -> tuple[jax.Array, Any]:
         matrix, pull, active, alpha = natural(form, known, own)
-        inverse, _ = linalg.inverse_and_logdet(matrix)
-        covariance = jnp.where(active[:, None] & active[None, :], inverse, 0.0)
+        both = active[:, None] & active[None, :]
+        covariance = jnp.where(both, linalg.inverse_and_logdet(matrix)[0], 0.0)
         variance = jnp.maximum(jnp.diagonal(covariance), 0.0)
         gamma = jnp.where(active, jnp.clip(1.0 - alpha * variance, 0.0, 1.0), 0.0)
         return total + covariance, (covariance @ pull, jnp.sqrt(variance), gamma)

@@ -200,7 +200,7 @@ def project(problem: Problem, tracks: list[np.ndarray], precision: list[np.ndarr
 
 
 def follow_states(problem: Problem, states: list[np.ndarray]) -> Point:
-    """Point at zero biases whose trajectories follow states (E, n) of each recursion closely, in what rows read."""
+    """Point at zero biases whose trajectories closely follow states (E, n), in what rows read."""
     read = (np.isin(np.arange(x.shape[1]), problem.model.entries(r)) for r, x in enumerate(states))
     return project(problem, states, [np.full(x.shape, CLOSE * own) for x, own in zip(states, read, strict=True)])
 
