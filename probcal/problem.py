@@ -37,6 +37,7 @@ from probcal.model.motions import (
     start_of,
     tails_of,
 )
+from probcal.model.padding import padded, repeated, roomy
 from probcal.model.rows import Block, Rows, addresses, late_by, make_block, pose_entries, pose_vector
 from probcal.model.sampled import SampledMotion
 from probcal.model.variants import aligned, at_measured
@@ -72,6 +73,13 @@ class Epochs:
     flow: tuple[Any, ...] = ()  # parts of the motion that `motion.flow_of` names
 
     @property
+    def padded(self) -> Epochs:
+        """The labels of the epochs and of those behind them that belong to no target."""
+        index, more = repeated(len(self.time)), np.arange(len(self.time), roomy(len(self.time)))
+        target = np.append(self.target, np.full(len(more), "", self.target.dtype))
+        return replace(self, time=self.time[index], target=target, order=np.append(self.order, more))
+
+    @property
     def position(self) -> tuple[int, int]:
         """First and last (excluded) state entry of the position."""
         return next((start, stop) for name, start, stop, _ in self.layout if name == "position")
@@ -79,7 +87,7 @@ class Epochs:
     @property
     def members(self) -> dict[str, np.ndarray]:
         """Mask (E,) of the epochs of each target."""
-        return {str(name): self.target == name for name in dict.fromkeys(self.target)}
+        return {str(name): self.target == name for name in dict.fromkeys(self.target) if name}
 
 
 class _Chained(NamedTuple):
@@ -159,6 +167,10 @@ class Problem:
         self.epoch_shift = float(np.abs(self.measurements.time - whole.time).max())  # s, of the rows to their epochs
         self.silent = _check_rows(self.measurements, network)
         self.levels: tuple[LevelRecord, ...]
+        self.epochs: list[Epochs]  # of each recursion
+        self.row_index: list[np.ndarray]  # rows of the table behind each block
+        self.model: Model
+        self.roomy = False  # whether there are masked rows, and epochs of no target
         self.begin = float(self.measurements.time.min())  # s, from which clocks that run count
         self.moved = np.zeros(len(self.measurements.time))  # s, of each row from its stated time
         self.timed: dict[str, float] = {}  # values of the biases of clocks that moved the rows, by label
@@ -286,7 +298,22 @@ class Problem:
         if data is not None:
             return found
         found.begin = self.begin
-        return found.at_times(self.moved, self.timed)
+        found = found.at_times(self.moved, self.timed)
+        return found.padded() if self.roomy else found
+
+    def padded(self) -> Problem:
+        """The same problem with masked rows and with epochs of no target, so that kernels serve others of its length.
+
+        The last row of a block is repeated, with nothing measured; behind the last epoch of a recursion its target
+        stays where it is.
+        """
+        return self if self.roomy else self._with(roomy=True)._longer()
+
+    def _longer(self) -> Problem:
+        self.model = jax.device_put(padded(jax.device_get(self.model)), may_alias=False)
+        self.epochs = [own.padded for own in self.epochs]
+        self.row_index = [index[repeated(len(index))] for index in self.row_index]
+        return self
 
     @property
     def clocks(self) -> np.ndarray:
@@ -523,7 +550,7 @@ class Problem:
         chained = [self._chained(layout, flow, names, levels, begun) for (layout, flow, _), names in forms.items()]
         self.epochs = [own.epochs for own in chained]
         gathered = self._gathered(levels, chained)
-        self.row_index = [own.mine for own in gathered]  # rows of the table behind each block
+        self.row_index = [own.mine for own in gathered]
         self.columns = [own.columns for own in gathered]  # their channels
         self.levels = tuple(levels.records)
         free = len(self.levels)
@@ -552,6 +579,8 @@ class Problem:
         )
         # put, not `asarray`: that compiles a copy for every new shape; later rows are put when they are epochs
         self.model = model if further else jax.device_put(model, may_alias=False)
+        if self.roomy and not further:
+            self._longer()
 
     def _longest(self, begun: Mapping[str, float], further: bool) -> float:
         """The longest time in s between two epochs of a target; of rows that come later, what it was before them."""

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import jax
@@ -10,15 +11,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+import xarray as xr
 
 from probcal import (
+    EA,
+    EM,
+    EMEA,
     MAP,
     Bias,
     Channel,
+    Cubature,
     InputError,
+    LeastSquares,
     Network,
     Node,
     Problem,
+    assess,
     fit,
     kernels,
     sensor,
@@ -26,6 +34,8 @@ from probcal import (
 )
 from probcal.geometry import norm
 from probcal.priors import Gaussian
+
+OTHERS = (EA(), EA(precisions="maximised"), EA(engine="superlu"), LeastSquares(), EM(Cubature()), EMEA(iterations=12))
 
 
 def gauge(factor=1.0, scale=1.0, name="gauge", values=(0.0, 1.0, 2.0)):
@@ -48,6 +58,21 @@ def position():
         return dict(position=pose.local(target.position))
 
     return position
+
+
+@contextmanager
+def counted():
+    """A list with an entry that is true for every kernel made meanwhile."""
+    made = []
+
+    def count(event, duration, **_):
+        made.append(event == "/jax/core/compile/backend_compile_duration")
+
+    jax.monitoring.register_event_duration_secs_listener(count)
+    try:
+        yield made
+    finally:
+        jax.monitoring.unregister_event_duration_listener(count)
 
 
 def test_types_that_compute_the_same_are_equal():
@@ -87,21 +112,34 @@ def test_a_sensor_declared_again_compiles_nothing_new(kept_kernels):
         problem = Problem(Network(places), motion, table)
         return fit(problem, MAP(), prior=Gaussian(), start=worlds.resting(problem))
 
-    made = []
-
-    def count(event, duration, **_):
-        made.append(event == "/jax/core/compile/backend_compile_duration")
-
     first = solve()
-    jax.monitoring.register_event_duration_secs_listener(count)
-    try:
+    with counted() as made:
         second = solve()
         assert sum(made) == 0
         jax.jit(lambda x: x + 1.25)(jnp.ones(3))
         assert sum(made) > 0, "what is counted is kernels"
-    finally:
-        jax.monitoring.unregister_event_duration_listener(count)
     np.testing.assert_array_equal(first["calibration"]["mean"], second["calibration"]["mean"])
+
+
+@pytest.mark.parametrize("method", [MAP(), *(pytest.param(own, marks=pytest.mark.ci) for own in OTHERS)], ids=lambda own: f"{own.name} {own.engine}")
+def test_a_padded_problem_has_the_answer_of_the_plain_one(method, monkeypatch):
+    problem = worlds.small(motion=worlds.two_motions, scans=9)
+    padded = fit(problem, method, key=1)
+    monkeypatch.setattr(Problem, "padded", lambda self: self)
+    plain = fit(problem, method, key=1)
+    assert padded["calibration"].to_dataset().sizes == plain["calibration"].to_dataset().sizes
+    for group in ("calibration", *(f"track/{name}" for name in plain["track"].children)):
+        xr.testing.assert_allclose(padded[group].to_dataset(), plain[group].to_dataset(), rtol=3e-6, atol=1e-8)
+
+
+def test_a_recording_of_about_the_same_length_compiles_nothing(kept_kernels):
+    """Neither its fit nor what is asked of it."""
+    problem = worlds.small(motion=worlds.two_motions, scans=11)
+    shorter = problem.select(np.arange(len(problem.measurements.time) - 3))
+    assess(problem, fit(problem, MAP()))
+    with counted() as made:
+        assess(shorter, fit(shorter, MAP()))
+    assert sum(made) == 0
 
 
 def test_the_catalogue_has_no_two_types_alike():

@@ -83,8 +83,7 @@ def true_states(problem: Problem, truth: Truth) -> list[np.ndarray]:
     for epochs in problem.epochs:
         known = np.isfinite(truth.positions(epochs.time, epochs.target, problem.network.dimension)).all(1)
         frames = {}
-        for name in dict.fromkeys(epochs.target.tolist()):
-            mine = epochs.target == name
+        for name, mine in epochs.members.items():
             track = truth.track(name, epochs.time[mine])
             if track is None:
                 continue

@@ -89,8 +89,10 @@ def simulated(at: Expansion, pulls: Sequence[Any], key: jax.Array) -> list[tuple
     `pulls` (E, n, D) are added to the scores of the states.
     """
     given, seed = [(own.L, own.half) for own in at.given_biases()], np.asarray(jax.random.key_data(key))
-    rng = np.random.default_rng(seed)
-    noises = tuple(rng.standard_normal((2, *pull.shape)) for pull in pulls)
+    noises = tuple(  # of each kind its own, so that those of further epochs change no other
+        np.stack([np.random.default_rng((*seed, r, kind)).standard_normal(pull.shape) for kind in range(2)])
+        for r, pull in enumerate(pulls)
+    )
     return _simulated(at.model, at.eliminated, given, tuple(pulls), noises)
 
 

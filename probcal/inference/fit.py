@@ -15,7 +15,7 @@ from probcal.inference.identity import stored_fit
 from probcal.inference.method import Context, Method
 from probcal.inference.methods import METHODS, check_problem, choose_prior
 from probcal.inference.progress import Monitor, OnProgress
-from probcal.inference.solve import solve
+from probcal.inference.solve import solve, with_room
 from probcal.priors import AnyPrior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
@@ -103,7 +103,8 @@ def calibrate(
         monitor.interruptible(),
     ):
         context = Context(keys[0], monitor, storage, fallback=fallback)
-        answer = solve(problem, method, chosen, context, start=start, starts=starts)
+        roomy, start = with_room(problem, method, start)
+        answer = solve(roomy, method, chosen, context, start=start, starts=starts)
         found, answer = finished(answer, keys[1], keep, monitor)
     found.attrs["seed"] = int(key) if isinstance(key, (int, np.integer)) else -1
     if store is not None:

@@ -136,6 +136,7 @@ def take_up(problem: Problem, fit: xr.DataTree) -> Judged:
     group = fit["calibration"].to_dataset()
     if group["bias_label"].values.tolist() != list(problem.labels):
         raise InputError("assess: the tree was fitted with other free biases; give the problem as it was fitted")
+    problem = problem if "block" in group else problem.padded()
     problem = problem.unlinked() if fit.attrs.get("motion") == "left out" else problem.untilted
     problem = problem.retimed(group["mean"].values / problem.scales)
     problem = _weighted(problem, dict(each_track(fit)))

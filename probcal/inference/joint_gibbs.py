@@ -288,6 +288,7 @@ class Gibbs(Sampler):
     priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
     work = GibbsChains
     chunk: ClassVar[int] = 25
+    roomy: ClassVar[bool] = False
     engined: ClassVar[bool] = True
     refusal: ClassVar[str] = (
         "turns: the posterior is too far from the Gaussian of its linearised rows; take collapsed or nuts, of fewer"

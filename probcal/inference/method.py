@@ -115,6 +115,7 @@ class Method(ABC):
     work: ClassVar[type[MethodTask]]  # what it does on a problem, where `task` does not choose
     climbs: ClassVar[bool] = True  # to a mode; others start at the joint mode where noise levels are unknown
     engined: ClassVar[bool] = False  # whether it asks the engine that suits the size, and no other form
+    roomy: ClassVar[bool] = True  # whether it takes a padded problem: not what draws all states together
 
     @property
     def by_particles(self) -> bool:

@@ -46,6 +46,7 @@ class NUTS(FramedSampler):
     crosses: ClassVar[bool] = True
     roams: ClassVar[bool] = True
     chunk: ClassVar[int] = 20
+    roomy: ClassVar[bool] = False
 
     def __post_init__(self):
         super().__post_init__()

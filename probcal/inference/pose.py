@@ -110,8 +110,8 @@ def moved(model: Model, frame: Frame, theta: jax.Array, key: jax.Array) -> Frame
     mean = jnp.mean(theta, 0)
     frame = frame_at(model, smooth_tracks(model, place(model, frame, mean, resting)))
     for k in range(FITTINGS):
-        keys = jax.random.split(jax.random.fold_in(key, k), len(resting))
-        eps = tuple(jax.random.normal(s, (FITTED, *x.shape)) for s, x in zip(keys, resting, strict=True))
+        keys = jax.random.split(jax.random.fold_in(key, k), (FITTED, len(resting)))
+        eps = jax.vmap(frame.normals)(keys)
         frame = refined(model, frame, theta[:: theta.shape[0] // FITTED][:FITTED], eps)
     return frame
 

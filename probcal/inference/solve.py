@@ -15,6 +15,7 @@ from probcal.inference.methods import MAP
 from probcal.inference.progress import Monitor, Stopped
 from probcal.inference.run import Maximiser
 from probcal.labels import listed
+from probcal.model.padding import longer
 from probcal.modes import further_starts
 from probcal.modes import optima as optima_of
 from probcal.modes.clocks import ROUNDS, first_times, settled_times, taken_there
@@ -28,6 +29,14 @@ from probcal.simulate import derived_keys
 from probcal.wings import of_wing
 
 STILL = 0.1  # sd by which no clock moves at the end of them
+
+
+def with_room(problem: Problem, method: Method, start: Point | None) -> tuple[Problem, Point | None]:
+    """The problem with room for a few more rows and epochs where that changes no answer, and a start in its form."""
+    if not method.roomy or method.by_particles or not choose_fast(problem.model).cheap:
+        return problem, start
+    problem = problem.padded()
+    return problem, start if start is None else start._replace(trajectories=longer(start.trajectories))
 
 
 def solve(

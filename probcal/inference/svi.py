@@ -59,6 +59,7 @@ class SVI(FramedSampler):
     name: ClassVar[str] = "SVI"
     priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
     chunk: ClassVar[int] = 50
+    roomy: ClassVar[bool] = False
     exact: ClassVar[bool] = False
     intervals: ClassVar[str] = (
         "quantiles of a variational approximation: too narrow where the guide does not fit, see k-hat"

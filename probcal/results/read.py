@@ -269,4 +269,5 @@ def saved_by_epoch(epochs: Epochs, tracked: dict[str, xr.Dataset], name: str, wh
         if own is None or name not in own or own.sizes["time"] != mine.sum():
             raise InputError(f"assess: the tree was fitted with other {what}; give the problem as it was fitted")
         parts.append(own[name].values)
-    return np.concatenate(parts)
+    found = np.concatenate(parts)
+    return found[np.minimum(np.arange(len(epochs.time)), len(found) - 1)]
