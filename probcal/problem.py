@@ -89,6 +89,11 @@ class Epochs:
         """Mask (E,) of the epochs of each target."""
         return {str(name): self.target == name for name in dict.fromkeys(self.target) if name}
 
+    def joined(self, parts: Sequence[np.ndarray], axis: int = 0) -> np.ndarray:
+        """Values of each target at its epochs, along an axis, as one array; epochs of no target repeat the last."""
+        found = np.concatenate(parts, axis)
+        return np.take(found, np.minimum(np.arange(len(self.time)), found.shape[axis] - 1), axis)
+
 
 class _Chained(NamedTuple):
     """The targets of one recursion, one after the other."""

@@ -121,7 +121,11 @@ def test_a_sensor_declared_again_compiles_nothing_new(kept_kernels):
     np.testing.assert_array_equal(first["calibration"]["mean"], second["calibration"]["mean"])
 
 
-@pytest.mark.parametrize("method", [MAP(), *(pytest.param(own, marks=pytest.mark.ci) for own in OTHERS)], ids=lambda own: f"{own.name} {own.engine}")
+@pytest.mark.parametrize(
+    "method",
+    [MAP(), *(pytest.param(own, marks=pytest.mark.ci) for own in OTHERS)],
+    ids=lambda own: f"{own.name} {own.engine}",
+)
 def test_a_padded_problem_has_the_answer_of_the_plain_one(method, monkeypatch):
     problem = worlds.small(motion=worlds.two_motions, scans=9)
     padded = fit(problem, method, key=1)

@@ -113,7 +113,7 @@ def tracks(tree: xr.DataTree) -> pd.DataFrame:
 
 def saved_states(problem: Problem, tracked: Mapping[str, xr.Dataset]) -> list[np.ndarray]:
     """Draws of the states (chain, draw, E, n) of each recursion that the tracks of a tree hold."""
-    return [np.concatenate([tracked[name]["state"].values for name in epochs.members], 2) for epochs in problem.epochs]
+    return [epochs.joined([tracked[name]["state"].values for name in epochs.members], 2) for epochs in problem.epochs]
 
 
 @checked
@@ -269,5 +269,4 @@ def saved_by_epoch(epochs: Epochs, tracked: dict[str, xr.Dataset], name: str, wh
         if own is None or name not in own or own.sizes["time"] != mine.sum():
             raise InputError(f"assess: the tree was fitted with other {what}; give the problem as it was fitted")
         parts.append(own[name].values)
-    found = np.concatenate(parts)
-    return found[np.minimum(np.arange(len(epochs.time)), len(found) - 1)]
+    return epochs.joined(parts)
