@@ -71,45 +71,43 @@ def observe(root: jax.Array, columns: jax.Array) -> tuple[jax.Array, jax.Array, 
     Also the gains (n, u) of each by its whitened innovation, and the std (u,) of that innovation. Potter's square-root
     update (Bierman 1977, II.7): no product of the root with itself is formed.
     """
-    gains, stds = [], []
-    for j in range(columns.shape[1]):
-        seen = jnp.sum(root * columns[:, j, None], 0)
-        variance = 1.0 + jnp.sum(seen**2)
-        std = jnp.sqrt(variance)
+
+    def one(root: jax.Array, column: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        seen = jnp.sum(root * column[:, None], 0)
+        std = jnp.sqrt(1.0 + jnp.sum(seen**2))
         gain = jnp.sum(root * (seen / std)[None, :], 1)
-        root = root - gain[:, None] * (seen / (1.0 + std))[None, :]
-        gains.append(gain)
-        stds.append(std)
-    return root, jnp.stack(gains, 1), jnp.stack(stds)
+        return root - gain[:, None] * (seen / (1.0 + std))[None, :], (gain, std)
+
+    root, (gains, stds) = jax.lax.scan(one, root, columns.T)
+    return root, gains.T, stds
 
 
-def regress_rows(rows: jax.Array, known: jax.Array) -> jax.Array:
+def regress_rows(rows: jax.Array, known: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The C (p, n) for which rows (p, m) less C known are orthogonal to the rows `known` (n, m), of any rank.
 
-    Modified Gram-Schmidt of both together. Of a known row that is lost in rounding beside the others C has zero.
+    Also the lower triangle T (n, n) with T T' = known known'. Modified Gram-Schmidt of both together. Of a known row
+    that is lost in rounding beside the others C has zero.
     """
     n = known.shape[0]
-    least = LOST * jnp.sqrt(jnp.sum(known**2, 1))
+    number = jnp.arange(n, dtype=jnp.uint32)
 
-    def project(j, carry):
-        left, whole = carry
-        length = jnp.sqrt(jnp.sum(left[j] ** 2))
-        there = length > least[j]
-        unit = jnp.where(there, left[j] / jnp.where(there, length, 1.0), 0.0)
+    def project(left: jax.Array, own: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        row, least = left[own[0]], own[1]
+        length = jnp.sqrt(jnp.sum(row**2))
+        there = length > least
+        unit = jnp.where(there, row / jnp.where(there, length, 1.0), 0.0)
         column = jnp.sum(left * unit[None, :], 1)
-        return left - column[:, None] * unit[None, :], whole.at[:, j].set(column)
+        return left - column[:, None] * unit[None, :], column
 
-    def solve(i, carry):  # C times the triangle above is what stands below it
-        j = n - 1 - i
-        rest, found = carry
-        pivot = whole[j, j]
-        share = jnp.where(pivot > 0, rest[:, j] / jnp.where(pivot > 0, pivot, 1.0), 0.0)
-        return rest - share[:, None] * whole[j][None, :], found.at[:, j].set(share)
+    def solve(rest: jax.Array, own: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        j, row = own  # C times the triangle is what stands below it
+        share = jnp.where(row[j] > 0, rest[:, j] / jnp.where(row[j] > 0, row[j], 1.0), 0.0)
+        return rest - share[:, None] * row[None, :], share
 
-    left = jnp.concatenate([known, rows])
-    _, whole = jax.lax.fori_loop(0, n, project, (left, jnp.zeros((len(left), n), left.dtype)))
-    _, found = jax.lax.fori_loop(0, n, solve, (whole[n:], jnp.zeros((len(rows), n), left.dtype)))
-    return found
+    least = LOST * jnp.sqrt(jnp.sum(known**2, 1))
+    whole = jax.lax.scan(project, jnp.concatenate([known, rows]), (number, least))[1].T
+    found = jax.lax.scan(solve, whole[n:], (number, whole[:n]), reverse=True)[1].T
+    return found, jnp.tril(whole[:n])
 
 
 def semi_cholesky(matrices: jax.Array) -> jax.Array:
@@ -126,6 +124,7 @@ def semi_cholesky(matrices: jax.Array) -> jax.Array:
     return jnp.stack(columns, 2)
 
 
+@jax.jit
 def forward(root: jax.Array, right: jax.Array) -> jax.Array:
     """The y (E, n, m) with root y = right, for lower roots (E, n, n) and right-hand sides in their range.
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError, nearest
+from probcal.linalg import library
 
 PRECISION_BOUNDS = (1e-2, 1e8)  # of z; a fit with a bias at the lower bound is not an answer
 GROUPS = ("owner", "node", "type", "component", "vector")
@@ -71,7 +72,10 @@ class Precision(NamedTuple):
 
     def square(self, z: jax.Array) -> jax.Array:
         """z' (precision) z."""
-        return z @ self.pull(z)
+        xp = library(z, self.alpha)
+        z = xp.asarray(z)
+        parts = (z[members] @ (own @ z[members]) for members, own in self.coupling)
+        return sum(parts, (xp.asarray(self.alpha) * z) @ z)
 
     def log_determinant(self) -> jax.Array:
         """Log determinant, a flat bias counted as one."""

@@ -67,7 +67,7 @@ class _Traced(NamedTuple):
         return _Eliminated(point, compress_and_eliminate(self.model, point, linearise_rows(self.model, point))[1])
 
     def moved(self, at: _Eliminated, dz: jax.Array) -> Point:
-        return follow(self.model, at.point, at.solved, dz)
+        return follow(self.model, at.point, at.solved.parts, dz)
 
     def value(self, at: _Eliminated) -> jax.Array:
         return cost(self.model, at.point, self.prior) + 0.5 * at.solved.logdet

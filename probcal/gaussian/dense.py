@@ -75,7 +75,7 @@ class DenseExpansion:
 
     @cached_property
     def _density(self) -> float:
-        return float(density_of(self.model, self.point, self.eliminated.logdet))
+        return density_of(self.model, self.point, self.eliminated.logdet)
 
     def density(self) -> float:
         """Log density of the data given the biases at the point, up to the constant of the noises."""
@@ -115,7 +115,7 @@ class DenseExpansion:
 
     def moved(self, dz: Any) -> Point:
         """The point with the biases moved by dz (M,), all tracks following."""
-        return _moved(self.model, self.point, self.eliminated, jax.device_put(dz))
+        return follow(self.model, self.point, self.eliminated.parts, jax.device_put(dz))
 
     def _precision(self, factors: Factors) -> np.ndarray:
         """The precision of the biases; what rounding leaves below zero is no information."""
@@ -189,7 +189,6 @@ class DenseExpansion:
 
 
 _solved = jax.jit(Dense.of)
-_moved = jax.jit(follow)
 
 
 @jax.jit

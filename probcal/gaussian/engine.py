@@ -14,10 +14,9 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from probcal.gaussian.mode import Eliminated, Point, log_density, mixing_gain
+from probcal.gaussian.mode import Eliminated, Point, level_square, log_density, mixing_gain
 from probcal.model.model import Data, Model
 from probcal.model.rows import Linearised
 from probcal.priors import Precision
@@ -254,12 +253,11 @@ def noise_information(at: Expansion, factors: Factors) -> tuple[Data, tuple[jax.
     return _noise_information(at.model, at.point, tuple(at.predicted(factors)), tuple(at.noises(factors)))
 
 
-@jax.jit
-def density_of(model: Model, point: Point, volume: jax.Array) -> jax.Array:
+def density_of(model: Model, point: Point, volume: jax.Array) -> float:
     """Log density of the data at a point whose trajectories have a posterior precision of log
     determinant `volume`."""
-    spread = jnp.sum((point.levels / model.level_spread) ** 2)
-    return log_density(model, point) + mixing_gain(model) - 0.5 * (spread + volume)
+    spread = level_square(model, point.levels)
+    return float(log_density(model, point) + mixing_gain(model) - 0.5 * (spread + np.asarray(volume)))
 
 
 @jax.jit

@@ -68,7 +68,8 @@ class SigmaPoints(EStep):
         """Trajectories at the mean of their smoothed density, rows expected over it."""
         rule = type(self).centre
         lins = sigma.regress_blocks(model, point, state_covariances(model, point), rule)
-        smoothed = follow(model, point, eliminate_rows(model, point, lins, joint=False), jnp.zeros_like(point.z))
+        parts = eliminate_rows(model, point, lins, joint=False).parts
+        smoothed = follow(model, point, parts, jnp.zeros_like(point.z))
         # the mean of a density lies off its mode, by half a unit of cost a dimension at most in the Gaussian case
         slack = 0.5 * sum(u.size for u in point.noises)
         point, refused = shorten(model, point, smoothed, prior, slack)

@@ -160,7 +160,7 @@ def refined(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, 
     lins = averaged(model, frame, theta, eps)
     compressed = compress(model, lins)
     solved = eliminate_compressed(model, frame.point.noises, frame.point.levels, compressed)
-    point = follow(model, frame.point, solved, jnp.zeros_like(frame.point.z), free=True)
+    point = follow(model, frame.point, solved.parts, jnp.zeros_like(frame.point.z), free=True)
     return _frame(model, point, averaged(model, frame._replace(point=point), theta, eps))
 
 

@@ -15,9 +15,10 @@ import numpy as np
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.room import check_room
-from probcal.gaussian.search import DAMPING, ROUNDING, between, branch, damped_on, halved, until_over
+from probcal.gaussian.search import DAMPING, ROUNDING, between, blank, branch, damped_on, halved, repeated
 from probcal.gaussian.solves import Dense
-from probcal.model.model import At, Model, Recursion, Where
+from probcal.linalg import library
+from probcal.model.model import At, Model, Recursion, Tail, Where
 from probcal.model.rows import Linearised
 from probcal.model.trajectories import Trajectories
 from probcal.priors import Precision
@@ -101,7 +102,7 @@ def factors(part: Recursion, levels: jax.Array) -> jax.Array:
 def inverse_factors(part: Recursion, levels: jax.Array) -> jax.Array:
     """Pseudo-inverse (E, n, n) of the noise factors at log levels (H,): 0 where no noise drives."""
     L = factors(part, levels)
-    return jax.vmap(linalg.regress_rows, (None, 0))(jnp.eye(L.shape[1]), L)
+    return jax.vmap(linalg.regress_rows, (None, 0))(jnp.eye(L.shape[1]), L)[0]
 
 
 @partial(jax.jit, inline=True)
@@ -121,16 +122,31 @@ def driven_states(part: Recursion, levels: jax.Array, noises: jax.Array) -> jax.
 
 def log_likelihood(model: Model, point: Where) -> jax.Array:
     """Log-likelihood of all data at a point, with the tilt of the model."""
-    beside = jnp.zeros(()) if model.tilt is None else model.tilt.value(point.z)
-    return sum((jnp.sum(part) for part in model.log_likelihood(point)), beside)
+    return sum((jnp.sum(part) for part in model.log_likelihood(point)), _tilt(model, point))
 
 
 def log_density(model: Model, point: Point) -> jax.Array:
     """Log density of data and whitened noises given biases and levels, up to the constant of the noises.
 
     Noise that is not Gaussian has the precisions of the model here; `mixed_density` integrates them.
+    The host adds the costs of tracks, a kernel that their search uses too.
     """
+    if library(*jax.tree.leaves((model, point))) is np:
+        costs, _ = part_way(model, point, point, np.zeros(sum(model.targets)))
+        return _tilt(model, point) - np.asarray(costs).sum()
     return log_likelihood(model, point) - 0.5 * point.trajectories.square
+
+
+def _tilt(model: Model, point: Where) -> jax.Array:
+    """What the tilt of the model adds to the log density at a point."""
+    return np.zeros(()) if model.tilt is None else model.tilt.value(point.z)
+
+
+def track_costs(model: Model, point: Point) -> jax.Array:
+    """Negative log density (T,) of the data and the whitened noises of each target."""
+    sums = model.by_epoch(model.log_likelihood(point))
+    own = model.each(lambda _, own, u: 0.5 * jnp.sum(u**2, 1) - own, sums, point.noises)
+    return jnp.concatenate(model.by_target(own))
 
 
 def mixed_density(model: Model, point: Point) -> jax.Array:
@@ -150,26 +166,39 @@ def mixing_gain(model: Model) -> jax.Array:
 
     With q(trajectory) q(w), log p(data) is at least the evidence at E w and this sum (Ting, Theodorou, Schaal 2007).
     """
-    parts = [
-        jnp.sum(jnp.where(tail.on, tail.family.mixing_gain(tail.weight, tail.size), 0.0))
-        for part in model.recursions
-        for tail in part.tails
-    ]
-    return sum(parts, jnp.zeros(()))
+    return sum((_mixing_gain(tail) for part in model.recursions for tail in part.tails), np.zeros(()))
+
+
+@jax.jit
+def _mixing_gain(tail: Tail) -> jax.Array:
+    return jnp.sum(jnp.where(tail.on, tail.family.mixing_gain(tail.weight, tail.size), 0.0))
 
 
 def widening(model: Model, levels: jax.Array) -> jax.Array:
     """Log determinant by which the levels widen the noises that they multiply."""
-    levels = jnp.concatenate([levels, jnp.zeros(1, levels.dtype)])
-    parts = [jnp.sum(jnp.any(part.L != 0, 1) * levels[part.level]) for part in model.recursions]
-    precisions = [0.5 * tail.size * jnp.sum(jnp.log(tail.weight)) for part in model.recursions for tail in part.tails]
-    return sum(parts, jnp.zeros(())) - sum(precisions, jnp.zeros(()))
+    xp = library(levels, *jax.tree.leaves(model.recursions))
+    levels, parts = xp.concatenate([xp.asarray(levels), np.zeros(1)]), list[Any]()
+    for part in model.recursions if model.driven else ():
+        parts.append((xp.asarray(part.L) != 0).any(1) * levels[xp.asarray(part.level)])
+    parts += [-0.5 * tail.size * xp.log(tail.weight) for part in model.recursions for tail in part.tails]
+    return sum((xp.sum(part) for part in parts), np.zeros(()))
+
+
+def level_square(model: Model, levels: jax.Array) -> jax.Array:
+    """Sum of squares of log levels (H,) over their spreads."""
+    xp = library(levels, model.level_spread)
+    return ((xp.asarray(levels) / xp.asarray(model.level_spread)) ** 2).sum()
 
 
 def cost(model: Model, point: Point, prior: Precision) -> jax.Array:
     """Negative log joint density of data, trajectories, biases and unknown levels, up to constants."""
-    known = prior.square(point.z) + jnp.sum((point.levels / model.level_spread) ** 2)
-    return 0.5 * known + widening(model, point.levels) - log_density(model, point)
+    return _known(model, point, prior) - log_density(model, point)
+
+
+def _known(model: Model, point: Point, prior: Precision) -> jax.Array:
+    """The part of the cost that no data tell."""
+    known = prior.square(point.z) + level_square(model, point.levels)
+    return 0.5 * known + widening(model, point.levels)
 
 
 def eliminate(model: Model, point: Point, *, expected: bool, joint: bool = True) -> Eliminated:
@@ -230,13 +259,18 @@ def eliminate_compressed(
 
     The biases keep information G - B'W^-1 B: Paper B (17) with the covariance of whole trajectories for R-bar.
     """
+    kept = kept_of(model, levels, compressed)
+    information, score, logdet = _eliminated(model, noises, levels, compressed[:2], kept, joint)
+    return Eliminated(information, score, compressed.score, logdet, kept)
+
+
+def kept_of(model: Model, levels: jax.Array, compressed: Compressed) -> tuple[Kept, ...]:
+    """What the elimination of trajectories at log levels (H,) keeps of each recursion."""
     parts = model.each_layout(compressed.states, compressed.crosses)
-    kept = tuple(
+    return tuple(
         Kept(J, pull, cross, gains_of(part, levels, J, model.entries(r)))
         for r, (part, (J, pull), cross) in enumerate(parts)
     )
-    information, score, logdet = _eliminated(model, noises, levels, compressed[:2], kept, joint)
-    return Eliminated(information, score, compressed.score, logdet, kept)
 
 
 @partial(jax.jit, static_argnames="used")
@@ -272,24 +306,31 @@ def _stacked(columns: tuple[jax.Array, jax.Array]) -> list[jax.Array]:
     return [own.reshape(own.shape[0] * own.shape[1], own.shape[2]) for own in columns]
 
 
+@jax.jit
+def _direction(solved: Eliminated, z: jax.Array, prior: Precision, damping: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Damped Newton step (M,) of the biases, and the slope of the cost along it at fixed trajectories."""
+    matrix = solved.information + prior.matrix() + damping * jnp.eye(len(z))
+    dz = Dense.of(matrix).solve(solved.score - prior.pull(z))
+    return dz, (solved.pull - prior.pull(z)) @ dz
+
+
 def _proposal(
     model: Model, point: Point, prior: Precision, damping: jax.Array, joint: bool, solved: Eliminated
 ) -> tuple[Point, jax.Array]:
     """Full Gauss-Newton step from a point eliminated there, and the decrease of the cost that it promises."""
-    dz = jnp.zeros_like(point.z)
+    xp, dz, slope = library(point.z, damping), np.zeros(model.biases), 0.0
     if joint and model.biases:  # an arrowhead: the tip first, then the trajectories follow
-        matrix = solved.information + prior.matrix() + damping * jnp.eye(model.biases)
-        dz = Dense.of(matrix).solve(solved.score - prior.pull(point.z))
-    proposal = follow(model, point, solved, dz)
-    slope = -prior.pull(point.z) @ dz
-    slope = slope + (solved.pull @ dz if joint and model.biases else 0.0)
-    steps = jax.tree.map(jnp.subtract, proposal.trajectories, point.trajectories)
+        dz, slope = map(xp.asarray, _direction(solved._replace(parts=()), point.z, prior, damping))
+    proposal = follow(model, point, solved.parts, dz)
+    pairs = (point.trajectories, proposal.trajectories)
+    steps = jax.tree.map(lambda old, new: xp.asarray(new) - xp.asarray(old), *pairs)
     for _, kept, dx, u, du in model.each_layout(solved.parts, steps.states, point.noises, steps.noises):
-        slope = slope + jnp.sum(kept.pull * dx) - jnp.sum(u * du)
+        slope = slope + xp.vdot(kept.pull, dx) - xp.vdot(u, du)
     return proposal, 0.5 * slope
 
 
-def follow(model: Model, point: Point, solved: Eliminated, dz: jax.Array, *, free: bool = False) -> Point:
+@partial(jax.jit, static_argnames="free")
+def follow(model: Model, point: Point, parts: tuple[Kept, ...], dz: jax.Array, *, free: bool = False) -> Point:
     """Move the biases by dz (M,) and every trajectory to its smoothed response.
 
     Where scores are `free`, some data may have one without an information.
@@ -301,8 +342,21 @@ def follow(model: Model, point: Point, solved: Eliminated, dz: jax.Array, *, fre
         smooth = rec.smooth(part.F, kept.gain, column[:, :, None], drift, free=free)
         return x + smooth.states[:, :, 0], smooth.noises[:, :, 0]
 
-    tracks = point.trajectories.map(smoothed, model.recursions, solved.parts)
+    tracks = point.trajectories.map(smoothed, model.recursions, parts)
     return Point(tracks, point.z + dz, point.levels)
+
+
+@jax.jit
+def part_way(model: Model, point: Point, full: Point, shares: jax.Array) -> tuple[jax.Array, Point]:
+    """The costs of tracks (T,) where these have gone shares (T,) of the way to another point, and the point there.
+
+    The biases go by the largest share.
+    """
+    own = jnp.split(shares, np.cumsum(model.targets)[:-1])
+    by_epoch = model.each(lambda part, share: share[part.target][:, None], own)
+    most = jnp.max(shares, initial=0.0)
+    found = jax.tree.map(between, point, full, Point(by_epoch, by_epoch, most, most))
+    return track_costs(model, found), found
 
 
 def shortened(
@@ -313,8 +367,13 @@ def shortened(
     Returns the point, its cost and the part, 0 where there is none. Consistent trajectories stay
     consistent.
     """
-    share, value = halved(lambda share: cost(model, between(point, proposal, share), prior), bound)
-    return between(point, proposal, share), value, share
+
+    def at(share: jax.Array) -> tuple[jax.Array, Point]:
+        costs, found = part_way(model, point, proposal, share * np.ones(sum(model.targets)))
+        return _known(model, found, prior) - _tilt(model, found) + library(share).sum(costs), found
+
+    share, value, found = halved(at, bound)
+    return found, value, share
 
 
 class Mode(NamedTuple):
@@ -352,58 +411,39 @@ def find_mode(
         return eliminate(model, point, expected=False, joint=joint)
 
     def body(s: _Search) -> _Search:
-        point = s.mode.point
-        solved = at(point) if known is None else branch(s.mode.iterations == 0, lambda _: known, at, point)
-        return _stepped(model, prior, s, solved, iterations, tolerance, joint, once)
+        before = s.mode
+        xp = library(before.cost)
+        first = before.iterations == 0
+        solved = at(before.point) if known is None else branch(first, lambda _: known, at, before.point)
+        proposal, promised = _proposal(model, before.point, prior, s.damping, joint, solved)
+        point, value, share = shortened(model, before.point, proposal, prior, before.cost)
+        better, damping = share > 0, damped_on(s.damping, share)
+        change = xp.where(better, before.cost - value, xp.inf)
+        rounding = ROUNDING * abs(before.cost)
+        small = abs(promised) <= xp.maximum(tolerance, rounding)
+        # no step lowers the cost by more than its rounding, and none promised to
+        still = (~better | (change <= rounding)) & (s.damping <= 1.0) & small & xp.isfinite(before.cost)
+        done = (better & (change < tolerance) & (s.damping <= 1.0)) | (damping > DAMPING) | still
+        moved = (before.gained > 0) | (better & (change > 0))
+        converged, count = done & ((change < tolerance) | still), before.iterations + 1
+        mode = Mode(point, value, count, converged, ~moved & ~converged, s.begun - value, before.volume)
+        return _Search(mode, s.begun, damping, done | (count >= iterations) | (once & moved))
 
-    return until_over(body, _begun(model, start, prior, iterations)).mode
-
-
-@jax.jit
-def _begun(model: Model, start: Point, prior: Precision, iterations: int) -> _Search:
-    value, zero, no = cost(model, start, prior), jnp.zeros(()), jnp.zeros((), bool)
-    mode = Mode(start, value, jnp.zeros((), int), no, ~no, zero, zero)
-    return _Search(mode, value, zero, no | (iterations <= 0))
-
-
-@partial(jax.jit, static_argnames=("joint", "once"))
-def _stepped(
-    model: Model,
-    prior: Precision,
-    s: _Search,
-    solved: Eliminated,
-    iterations: int,
-    tolerance: float,
-    joint: bool,
-    once: bool,
-) -> _Search:
-    before = s.mode
-    proposal, promised = _proposal(model, before.point, prior, s.damping, joint, solved)
-    point, value, share = shortened(model, before.point, proposal, prior, before.cost)
-    better, damping = share > 0, damped_on(s.damping, share)
-    change = jnp.where(better, before.cost - value, jnp.inf)
-    rounding = ROUNDING * jnp.abs(before.cost)
-    small = jnp.abs(promised) <= jnp.maximum(tolerance, rounding)
-    # no step lowers the cost by more than its rounding, and none promised to
-    still = (~better | (change <= rounding)) & (s.damping <= 1.0) & small & jnp.isfinite(before.cost)
-    done = (better & (change < tolerance) & (s.damping <= 1.0)) | (damping > DAMPING) | still
-    moved = (before.gained > 0) | (better & (change > 0))
-    converged, count = done & ((change < tolerance) | still), before.iterations + 1
-    mode = Mode(point, value, count, converged, ~moved & ~converged, s.begun - value, before.volume)
-    return _Search(mode, s.begun, damping, done | (count >= iterations) | (once & moved))
+    value, zero, no = cost(model, start, prior), np.zeros(()), np.zeros((), bool)
+    mode = Mode(start, value, np.zeros((), int), no, ~no, zero, zero)
+    return repeated(lambda s: ~s.over, body, _Search(mode, value, zero, no | (iterations <= 0))).mode
 
 
 class _Tracking(NamedTuple):
     point: Point
     costs: jax.Array  # (T,) of each target
-    solved: Eliminated  # of some point on the way
+    parts: tuple[Kept, ...] | None  # eliminated at some point on the way
     renew: jax.Array  # eliminate anew at the next step
     change: jax.Array
     moving: jax.Array  # (T,) tracks that are not yet at their mode
     iteration: jax.Array
 
 
-@jax.jit
 def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -> Point:
     """Trajectories at held biases until the cost of each changes by less than `tolerance`: iterated EKS by chords.
 
@@ -411,47 +451,40 @@ def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -
     they need the score alone. Each track halves a step by itself, so that none waits for another; one that no part of a
     step improves stays where it is: on a cusp, where it grazes a sensor.
     """
-    still = jnp.zeros_like(start.z)
-    score = jax.grad(lambda states, at: log_likelihood(model, At(states, at.z, at.levels)))
 
-    def at(point: Point) -> Eliminated:
-        return eliminate(model, point, expected=False, joint=False)
-
-    def costs(at: Point) -> jax.Array:
-        sums = model.by_epoch(model.log_likelihood(at))
-        own = model.each(lambda _, own, u: 0.5 * jnp.sum(u**2, 1) - own, sums, at.noises)
-        return jnp.concatenate(model.by_target(own))
-
-    def part_way(point: Point, full: Point, shares: jax.Array) -> Point:
-        own = jnp.split(shares, np.cumsum(model.targets)[:-1])
-        by_epoch = model.each(lambda part, share: share[part.target][:, None], own)
-        tracks = Trajectories(by_epoch, by_epoch)
-        return point._replace(trajectories=jax.tree.map(between, point.trajectories, full.trajectories, tracks))
+    def at(point: Point) -> tuple[Kept, ...]:
+        return kept_of(model, point.levels, compress_rows(model, point.z, rows_at(model, point, False), False))
 
     def body(s: _Tracking) -> _Tracking:
-        solved = jax.lax.cond(s.renew, at, lambda _: s.solved, s.point)
-        pulls = score(s.point.states, s.point)
-        parts = model.each(lambda _, kept, pull: kept._replace(pull=pull), solved.parts, pulls)
-        full = follow(model, s.point, solved._replace(parts=parts), still, free=True)
+        xp = library(s.costs)
+        parts = branch(s.renew, at, lambda _: s.parts, s.point)
+        full = _tracked(model, s.point, parts)
 
-        def taken(shares: jax.Array) -> Point:
-            return part_way(s.point, full, jnp.where(s.moving, shares, 0.0))
-
-        bound = jnp.where(s.moving, s.costs, jnp.inf)
-        shares, after = halved(lambda shares: costs(taken(shares)), bound)
-        stuck, gain = s.moving & (shares == 0), jnp.where(s.moving, s.costs - after, 0.0)
-        moving = s.moving & jnp.where(stuck, ~s.renew, gain >= tolerance)
-        waits, most = jnp.any(stuck), jnp.max(gain)
+        bound = xp.where(s.moving, s.costs, xp.inf)
+        shares, after, point = halved(
+            lambda shares: part_way(model, s.point, full, xp.where(s.moving, shares, 0.0)), bound
+        )
+        stuck, gain = s.moving & (shares == 0), xp.where(s.moving, s.costs - after, 0.0)
+        moving = s.moving & xp.where(stuck, ~s.renew, gain >= tolerance)
+        waits, most = xp.any(stuck), xp.max(gain)
         return _Tracking(
-            taken(shares), jnp.where(s.moving, after, s.costs), solved, waits | (most > CHORD * s.change),
-            jnp.where(waits, s.change, most), moving, s.iteration + 1,
+            point, xp.where(s.moving, after, s.costs), parts, waits | (most > CHORD * s.change),
+            xp.where(waits, s.change, most), moving, s.iteration + 1,
         )  # fmt: skip
 
-    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(at, start))
-    begun, infinite = costs(start), jnp.full((), jnp.inf)
-    every = jnp.ones(begun.shape, bool)
-    first = _Tracking(start, begun, blank, jnp.ones((), bool), infinite, every, jnp.zeros((), int))
-    return jax.lax.while_loop(lambda s: jnp.any(s.moving) & (s.iteration < iterations), body, first).point
+    xp = library(*jax.tree.leaves((model, start)))
+    parts, yes = None if xp is np else blank(at, start), np.ones((), bool)
+    begun = xp.asarray(part_way(model, start, start, np.zeros(sum(model.targets)))[0])
+    first = _Tracking(start, begun, parts, yes, np.full((), np.inf), xp.ones(begun.shape, bool), np.zeros((), int))
+    return repeated(lambda s: s.moving.any() & (s.iteration < iterations), body, first).point
+
+
+@jax.jit
+def _tracked(model: Model, point: Point, parts: tuple[Kept, ...]) -> Point:
+    """The point with every trajectory at the end of a step at held biases, by its score there."""
+    pulls = jax.grad(lambda states: log_likelihood(model, At(states, point.z, point.levels)))(point.states)
+    parts = model.each(lambda _, kept, pull: kept._replace(pull=pull), parts, pulls)
+    return follow(model, point, parts, jnp.zeros_like(point.z), free=True)
 
 
 def smooth_tracks(model: Model, point: Point, iterations: int = 20) -> Point:

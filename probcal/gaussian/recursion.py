@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from probcal.gaussian.scans import filter_roots, in_parallel, inverse_root, recur, recur_squared
-from probcal.linalg import forward, multiply_rows, regress_rows, semi_cholesky
+from probcal.linalg import forward, multiply_rows, semi_cholesky
 
 
 class Gains(NamedTuple):
@@ -48,13 +48,10 @@ def gains(F: jax.Array, L: jax.Array, J: jax.Array, used: tuple[int, ...]) -> Ga
     everywhere = jnp.broadcast_to(eye, root.shape)
     data = jnp.zeros((E, n, len(entries)), F.dtype).at[:, entries].set(root)
     solve = jnp.zeros((E, len(entries), n), F.dtype).at[:, :, entries].set(forward(root, everywhere))
-    predicted, updated, gain, std = filter_roots(F, L, data)
+    predicted, updated, gain, std, shares = filter_roots(F, L, data)
     whiten = inverse_root(data, gain, std)
     gain = gain @ whiten
     keep = jnp.eye(n, dtype=F.dtype)[None] - gain @ data.mT
-    before = jnp.concatenate([jnp.zeros_like(updated[:1]), updated[:-1]])
-    causes = jnp.pad(before, ((0, 0), (0, n), (0, n))).at[:, n:, n:].set(jnp.eye(n, dtype=F.dtype))
-    shares = jax.vmap(regress_rows)(causes, jnp.concatenate([F @ before, L], 2))
     logdet = 2.0 * jnp.sum(jnp.log(std))
     return Gains(data, solve, predicted, updated, whiten, gain, keep, shares[:, :n], shares[:, n:], logdet)
 

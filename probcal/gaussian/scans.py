@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from probcal.linalg import forward, multiply, observe, tria
+from probcal.linalg import forward, multiply, observe, regress_rows, tria
 
 PARALLEL: bool | None = None  # None: wherever the backend is no CPU; read where a kernel is traced
 
@@ -60,23 +60,23 @@ class FilterPass(NamedTuple):
     updated: jax.Array  # (E, n, n) root of the filtered covariance
     gain: jax.Array  # (E, n, u) gain of each datum by its whitened innovation, one after another
     std: jax.Array  # (E, u) std of that innovation
+    shares: jax.Array  # (E, 2n, n) regression of the state before an epoch, and of its noise, on its predicted state
 
 
 def filter_roots(F: jax.Array, L: jax.Array, data: jax.Array) -> FilterPass:
     """The covariance pass for transitions F and noise factors L (E, n, n), and unit-noise data `data`' x (E, n, u)."""
     n = F.shape[1]
-    if in_parallel():
-        before = _updated(F, L, data)
-        before = jnp.concatenate([jnp.zeros_like(before[:1]), before[:-1]])
-        predicted = jax.vmap(tria)(jnp.concatenate([F @ before, L], 2))
-        return FilterPass(predicted, *jax.vmap(observe)(predicted, data))
 
     def step(root: jax.Array, epoch: tuple[jax.Array, ...]) -> tuple[jax.Array, FilterPass]:
         F_k, L_k, G_k = epoch
-        predicted = tria(jnp.concatenate([multiply(F_k, root), L_k], 1))
+        causes = jnp.concatenate([jnp.pad(root, ((0, 0), (0, n))), jnp.eye(n, 2 * n, n, F.dtype)])
+        shares, predicted = regress_rows(causes, jnp.concatenate([multiply(F_k, root), L_k], 1))
         updated, gain, std = observe(predicted, G_k)
-        return updated, FilterPass(predicted, updated, gain, std)
+        return updated, FilterPass(predicted, updated, gain, std, shares)
 
+    if in_parallel():
+        before = _updated(F, L, data)
+        return jax.vmap(step)(jnp.concatenate([jnp.zeros_like(before[:1]), before[:-1]]), (F, L, data))[1]
     return jax.lax.scan(step, jnp.zeros((n, n), F.dtype), (F, L, data))[1]
 
 

@@ -110,15 +110,15 @@ def climb_on_host(
 
 def climb_traced(objective: Objective, start: Any, biases: int, iterations: int, tolerance: Any) -> Search:
     """The same inside a compiled function; expansions are pytrees."""
-    form = jax.eval_shape(objective.expand, start)
-    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)
 
     def body(s: Search) -> Search:
         moved = objective.moved(s.at, s.share * s.step)
         point = jax.tree.map(lambda new, old: jnp.where(s.taken == 0, old, new), moved, start)
         return search_step(objective, s, objective.expand(point), tolerance)
 
-    return jax.lax.while_loop(lambda s: ~s.done & (s.count <= iterations), body, Search.begin(blank, biases))
+    return jax.lax.while_loop(
+        lambda s: ~s.done & (s.count <= iterations), body, Search.begin(blank(objective.expand, start), biases)
+    )
 
 
 def damped_on(damping: Any, share: Any) -> Any:
@@ -140,14 +140,14 @@ def branch(condition: Any, yes: Callable[..., Any], no: Callable[..., Any], *giv
     return jax.lax.cond(condition, yes, no, *given)
 
 
-def until_over(step: Callable[[Any], Any], state: Any) -> Any:
-    """The state after steps until it is `over`, by a `while_loop` where it is traced.
+def repeated(on: Callable[[Any], Any], step: Callable[[Any], Any], state: Any) -> Any:
+    """The state after steps while it is to go on, by a `while_loop` where it is traced.
 
     The host calls kernels that other parts of a fit use too.
     """
     if library(*jax.tree.leaves(state)) is not np:
-        return jax.lax.while_loop(lambda state: ~state.over, step, state)
-    while not state.over:
+        return jax.lax.while_loop(on, step, state)
+    while on(state):
         state = step(state)
     return state
 
@@ -197,13 +197,7 @@ def _directed(objective: Objective, tolerance: Any, s: Search) -> Search:
         step, damping, fresh = state
         return fresh | (~(xp.isfinite(step).all() & (s.slope @ step >= 0)) & (damping <= DAMPING))
 
-    state: Any = s.step, s.damping, xp.ones((), bool)
-    if xp is np:
-        while lacking(state):
-            state = more(state)
-    else:
-        state = jax.lax.while_loop(lacking, more, state)
-    step, damping, _ = state
+    step, damping, _ = repeated(lacking, more, (s.step, s.damping, xp.ones((), bool)))
     promised = 0.5 * s.slope @ step
     converged = (promised <= tolerance) & (damping <= 1.0) & xp.isfinite(s.value)
     return s._replace(
@@ -227,24 +221,33 @@ def _direction(objective: Objective, s: Search, damping: Any) -> Any:
     return step + (inverse.T @ (own * share - changes @ step)) @ s.moves
 
 
-def halved(value: Callable[[jax.Array], jax.Array], bound: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Halve a step until its value does not exceed the bound.
+def blank(function: Callable[..., Any], *given: Any) -> Any:
+    """Zeros in the form of what a function gives, with which a traced loop begins."""
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, *given))
+
+
+def halved(value: Callable[[Any], tuple[Any, Any]], bound: Any) -> tuple[Any, Any, Any]:
+    """Halve a step until its value does not exceed the bound; `value` gives it for a fraction, and the point there.
 
     The bound is an array; each entry has a step length of its own. Returns the fractions of the
-    step, 0 where none would do, and their values, there the bound.
+    step, 0 where none would do, their values, and the point.
     """
+    xp = library(bound)
 
-    def shorter(state: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        share, before, tries = state
-        share = jnp.where((tries == 0) | (before <= bound), share, 0.5 * share)
-        return share, value(share), tries + 1
+    def shorter(state: Any) -> Any:
+        share, before, tries, _ = state
+        share = xp.where((tries == 0) | (before <= bound), share, xp.where(tries < HALVINGS, 0.5 * share, 0.0))
+        found, point = value(share)
+        return share, xp.asarray(found), tries + 1, point
 
-    def worse(state: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
-        return (state[2] == 0) | (jnp.any(~(state[1] <= bound)) & (state[2] < HALVINGS))
+    def worse(state: Any) -> Any:
+        return (state[2] == 0) | ((~(state[1] <= bound)).any() & (state[2] <= HALVINGS))
 
-    share, found, _ = jax.lax.while_loop(worse, shorter, (jnp.ones_like(bound), bound, jnp.zeros((), int)))
-    better = found <= bound
-    return jnp.where(better, share, 0.0), jnp.where(better, found, bound)
+    one = xp.ones_like(bound)
+    share, found, _, point = repeated(
+        worse, shorter, (one, bound, np.zeros((), int), None if xp is np else blank(value, one)[1])
+    )
+    return share, found, point
 
 
 def between(a: Any, b: Any, share: Any) -> Any:

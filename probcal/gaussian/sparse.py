@@ -131,7 +131,7 @@ class SparseExpansion:
 
     @cached_property
     def _density(self) -> float:
-        return float(density_of(self.model, self.point, self.eliminated.logdet))
+        return density_of(self.model, self.point, self.eliminated.logdet)
 
     def density(self) -> float:
         """Log density of the data given the biases at the point, up to the constant of the noises."""

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from probcal.devices import over_devices
 from probcal.gaussian.frame import place
+from probcal.gaussian.search import blank
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, conditional, log_prior
 from probcal.inference.sides import Sided, shifted, side_of
@@ -49,8 +50,7 @@ def keep(form: Form, posed: Posed, sample: Sample) -> Draw:
 
 def repeated(step: Callable[[Any], tuple[Any, Sample]], state: Any, thin: jax.Array) -> tuple[Any, Sample]:
     """The state after `thin` steps, and the last draw."""
-    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(step, state)[1])
-    return jax.lax.fori_loop(0, thin, lambda _, at: step(at[0]), (state, blank))
+    return jax.lax.fori_loop(0, thin, lambda _, at: step(at[0]), (state, blank(step, state)[1]))
 
 
 @partial(jax.jit, static_argnames=("method", "form"))

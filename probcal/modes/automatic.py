@@ -116,14 +116,9 @@ def polished(problem: Problem, start: Point, iterations: int = 30) -> Optimum:
 
 def sparse_cost(model: Model, point: Point) -> float:
     """Joint cost of a point with a Cauchy prior of scale one for each bias, infinite where there is none."""
-    found = float(_sparse_cost(model, point))
-    return found if np.isfinite(found) else np.inf
-
-
-@jax.jit
-def _sparse_cost(model: Model, point: Point) -> jax.Array:
     flat = Precision(jnp.zeros(model.biases))
-    return cost(model, point, flat) + jnp.sum(jnp.log1p(point.z**2))
+    found = float(cost(model, point, flat) + np.log1p(np.asarray(point.z) ** 2).sum())
+    return found if np.isfinite(found) else np.inf
 
 
 _value = operator.attrgetter("value")

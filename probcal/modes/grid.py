@@ -15,7 +15,7 @@ import numpy as np
 
 from probcal import linalg
 from probcal.gaussian import recursion as rec
-from probcal.gaussian.mode import Point, apart, cost, factors, gains_of, smooth_tracks
+from probcal.gaussian.mode import Point, apart, factors, gains_of, smooth_tracks
 from probcal.model import variants
 from probcal.model.model import At, Model, Recursion
 from probcal.model.rows import Linearised
@@ -30,6 +30,7 @@ CLOSE = 1e6  # precision of every state component at which a trajectory follows 
 NEAR = 0.05  # error of a position found on the grid, in extents
 WINDOW_ROWS = 60  # rows of a window that are looked at, where there are more
 BEAM = 200  # candidates a window that the path may pass
+KINEMATIC = {"position", "velocity", "acceleration"}  # components that a path fixes
 ROBUST = 4.0  # degrees of freedom of the start's Student-t loss
 
 
@@ -83,7 +84,7 @@ def profile(model: Model, r: int, span: tuple[int, int], z: jax.Array, place: ja
     mine = variants.part(model, r)
     held = np.zeros(n, bool)
     for name, start, stop, _ in mine.blocks[0].layout if mine.blocks else ():
-        held[start:stop] = name in ("position", "velocity", "acceleration")
+        held[start:stop] = name in KINEMATIC
     first = part.F[:, 0, 0] == 0
     precision = 1.0 / jnp.maximum(jnp.sum(factors(part, levels) ** 2, 2), 1e-12)
     precision = jnp.where(held[None, :], 1e12, jnp.where(first[:, None], precision, jnp.min(precision, 0)[None, :]))
@@ -187,15 +188,20 @@ def _smoothed(part: Recursion, gain: rec.Gains, pull: jax.Array) -> tuple[jax.Ar
 
 
 def project(problem: Problem, tracks: list[np.ndarray], precision: list[np.ndarray]) -> Point:
-    """Point at zero biases whose trajectories follow given states (E, n) with given precisions (E, n)."""
+    """Point at zero biases whose trajectories follow the entries of states (E, n) that rows read.
+
+    These have given precisions (E, n); the motion makes the others.
+    """
     levels: Any = np.zeros(len(problem.levels))
 
-    def consistent(part: Recursion, states: np.ndarray, weight: np.ndarray) -> tuple[jax.Array, jax.Array]:
-        told = tuple(np.flatnonzero(weight.any(0)).tolist())
-        gain = gains_of(part, levels, weight[:, :, None] * np.eye(weight.shape[1]), told)
+    def consistent(
+        part: Recursion, states: np.ndarray, weight: np.ndarray, used: tuple[int, ...]
+    ) -> tuple[jax.Array, jax.Array]:
+        gain = gains_of(part, levels, weight[:, :, None] * np.eye(weight.shape[1]), used)
         return _smoothed(part, gain, weight * states)
 
-    pairs = problem.model.each(consistent, tracks, precision)
+    read = map(problem.model.entries, range(len(tracks)))
+    pairs = problem.model.each(consistent, tracks, precision, read)
     return Point(Trajectories.of(pairs), *jax.device_put((np.zeros(problem.model.biases), levels)))
 
 
@@ -222,8 +228,10 @@ def grid_start(problem: Problem, z: Any = None, iterations: int = 30) -> Point:
             loss = _losses(problem, r, z, places)
         for mine in unknown:
             path[mine] = _path(problem, epochs.time[mine], loss[:, mine], places)
-        _, states = profile(problem.model, r, span, z, path)
-        states = np.array(states)
+        if {name for name, *_ in epochs.layout} <= KINEMATIC:
+            states = np.pad(path, ((0, 0), (span[0], problem.model.recursions[r].drift.shape[1] - span[1])))
+        else:
+            states = np.array(profile(problem.model, r, span, z, path)[1])
         with np.errstate(over="ignore"):  # gaps of 1e-300 s
             spread = np.sum(np.asarray(problem.model.recursions[r].L) ** 2, 2)
         precision = np.where(spread > 0, 1e4 / np.maximum(spread, 1e-300), 1e-9)
@@ -240,6 +248,3 @@ def grid_start(problem: Problem, z: Any = None, iterations: int = 30) -> Point:
 def track_mode(problem: Problem, point: Point, iterations: int = 100) -> Point:
     """Trajectories at held biases: iterated EKS from a point."""
     return smooth_tracks(problem.model, point, iterations)
-
-
-joint_cost = jax.jit(cost)

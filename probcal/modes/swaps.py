@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian.information import rejected
-from probcal.gaussian.mode import Point
-from probcal.modes.grid import grid_start, joint_cost, track_mode
+from probcal.gaussian.mode import Point, cost
+from probcal.modes.grid import grid_start, track_mode
 from probcal.modes.reflections import place_biases
 from probcal.priors import Precision
 from probcal.problem import Problem

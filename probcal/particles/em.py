@@ -127,14 +127,15 @@ def _averaged(state: Climb, expected: Expectation, how: ParticleSettings) -> Cli
 def _shortened(model: Model, found: Ensemble, states: Any, state: Climb, now: Precision, step: jax.Array) -> jax.Array:
     """The longest of the halved steps that does not lower the expectation."""
 
-    def value(z: jax.Array) -> jax.Array:
+    def lost(share: Any) -> tuple[jax.Array, Any]:
+        z = state.z + share * step
         if states is None:
             told = log_likelihood_over(model, found, z, state.levels)
         else:
             told = sum((jnp.sum(part) for part in model.log_likelihood(At(states, z, state.levels))), jnp.zeros(()))
-        return told - 0.5 * now.square(z)
+        return 0.5 * now.square(z) - told, z
 
-    share, _ = halved(lambda share: -value(state.z + share * step), -value(state.z))
+    share, *_ = halved(lost, lost(0.0)[0])
     return share * step
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.mode import factors
+from probcal.gaussian.search import blank
 from probcal.tracking.sampler.sampled import Association, Fit, Recording, chances, fitted, log_clutter
 from probcal.tracking.scan import View, detected, present
 from probcal.tracking.update import TINY, Biases, rows_from, updated
@@ -322,10 +323,8 @@ def move(
         fit = fitted(scene, views, found.a)
         return (fit, jax.lax.cond(first, propose, lambda _: found, fit)), fit
 
-    blank = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: fitted(scene, views, rest))
-    )
-    start = (blank, Proposal(rest, jnp.zeros(()), _nothing(blank)))
+    none = blank(fitted, scene, views, rest)
+    start = (none, Proposal(rest, jnp.zeros(()), _nothing(none)))
     (there, found), both = jax.lax.scan(pass_, start, jnp.array([True, False]))
     fit = jax.tree.map(lambda leaf: leaf[0], both)
     whole = (which == ALL_SCANS) | (which == SWAP)  # what was left is the association itself; its prior may have moved

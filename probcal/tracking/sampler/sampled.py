@@ -16,7 +16,7 @@ from jax.scipy.special import gammaln
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.mode import Eliminated, Kept, Point, eliminate, factors, follow, log_density
-from probcal.gaussian.search import between, halved
+from probcal.gaussian.search import between, blank, halved
 from probcal.gaussian.solves import Dense
 from probcal.model.epochs import Move
 from probcal.model.model import Model
@@ -142,17 +142,18 @@ def fitted(scene: Recording, views: tuple[View, ...], a: Association) -> Fit:
         (x, u, z), _, value, _, count = state
         solved = system(x, u, z)
         dz = Dense.of(jnp.sum(solved.information, 0) + prior.matrix()).solve(jnp.sum(solved.score, 0) - prior.pull(z))
-        moved = jax.vmap(lambda x, u, own: follow(model, at(x, u, z), own, dz))(x, u, solved)
+        moved = jax.vmap(lambda x, u, own: follow(model, at(x, u, z), own.parts, dz))(x, u, solved)
         full = (moved.states[0], moved.noises[0], z + dz)
 
-        share, new = halved(lambda share: cost(*between((x, u, z), full, share)), value)
-        return between((x, u, z), full, share), solved, new, value - new, count + 1
+        def part_way(share: jax.Array) -> tuple[jax.Array, Any]:
+            found = between((x, u, z), full, share)
+            return cost(*found), found
+
+        _, new, found = halved(part_way, value)
+        return found, solved, new, value - new, count + 1
 
     start = _begun(scene, L, used, a)
-    blank = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: system(*start, scene.z))
-    )
-    first = ((*start, scene.z), blank, cost(*start, scene.z), jnp.full((), jnp.inf), 0)
+    first = ((*start, scene.z), blank(system, *start, scene.z), cost(*start, scene.z), jnp.full((), jnp.inf), 0)
     (x, u, z), solved, value, _, _ = jax.lax.while_loop(lambda s: (s[3] > SETTLED) & (s[4] < STEPS), step, first)
     biases = Dense.of(jnp.sum(solved.information, 0) + prior.matrix())
     (kept,) = solved.parts
