@@ -448,8 +448,8 @@ def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -
     """Trajectories at held biases until the cost of each changes by less than `tolerance`: iterated EKS by chords.
 
     What was eliminated serves the next steps too while each gains a tenth of the one before or less (Kelley 1995, 5.4):
-    they need the score alone. Each track halves a step by itself, so that none waits for another; one that no part of a
-    step improves stays where it is: on a cusp, where it grazes a sensor.
+    they need the score alone. Each track halves a step by itself, so that none waits for another, where that raises its
+    cost by more than rounding; one that no part of a step improves stays where it is: on a cusp, grazing a sensor.
     """
 
     def at(point: Point) -> tuple[Kept, ...]:
@@ -460,7 +460,7 @@ def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -
         parts = branch(s.renew, at, lambda _: s.parts, s.point)
         full = _tracked(model, s.point, parts)
 
-        bound = xp.where(s.moving, s.costs, xp.inf)
+        bound = xp.where(s.moving, s.costs + ROUNDING * abs(s.costs), xp.inf)
         shares, after, point = halved(
             lambda shares: part_way(model, s.point, full, xp.where(s.moving, shares, 0.0)), bound
         )

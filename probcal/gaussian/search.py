@@ -14,7 +14,7 @@ import numpy as np
 
 from probcal.linalg import invert, library
 
-HALVINGS = 12  # lengths of a step that are tried, each half of the one before
+HALVINGS = 12  # lengths of a step that are tried, each half of the one before, the last 0
 KEPT = 8  # secants
 # share of the promised rise that a step must bring: half a step does along what motion noise fixes
 ENOUGH = 0.1
@@ -236,12 +236,12 @@ def halved(value: Callable[[Any], tuple[Any, Any]], bound: Any) -> tuple[Any, An
 
     def shorter(state: Any) -> Any:
         share, before, tries, _ = state
-        share = xp.where((tries == 0) | (before <= bound), share, xp.where(tries < HALVINGS, 0.5 * share, 0.0))
+        share = xp.where((tries == 0) | (before <= bound), share, xp.where(tries < HALVINGS - 1, 0.5 * share, 0.0))
         found, point = value(share)
         return share, xp.asarray(found), tries + 1, point
 
     def worse(state: Any) -> Any:
-        return (state[2] == 0) | ((~(state[1] <= bound)).any() & (state[2] <= HALVINGS))
+        return (state[2] == 0) | ((~(state[1] <= bound)).any() & (state[2] < HALVINGS))
 
     one = xp.ones_like(bound)
     share, found, _, point = repeated(
