@@ -15,7 +15,7 @@ import numpy as np
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.room import check_room
-from probcal.gaussian.search import DAMPING, ROUNDING, between, blank, branch, damped_on, halved, repeated
+from probcal.gaussian.search import DAMPING, ROUNDING, between, blank, branch, damped_on, halved, quiet, repeated
 from probcal.gaussian.solves import Dense
 from probcal.linalg import library
 from probcal.model.model import At, Model, Recursion, Tail, Where
@@ -190,6 +190,7 @@ def level_square(model: Model, levels: jax.Array) -> jax.Array:
     return ((xp.asarray(levels) / xp.asarray(model.level_spread)) ** 2).sum()
 
 
+@quiet
 def cost(model: Model, point: Point, prior: Precision) -> jax.Array:
     """Negative log joint density of data, trajectories, biases and unknown levels, up to constants."""
     return _known(model, point, prior) - log_density(model, point)
@@ -206,9 +207,9 @@ def eliminate(model: Model, point: Point, *, expected: bool, joint: bool = True)
     return eliminate_rows(model, point, rows_at(model, point, expected), joint=joint)
 
 
-@partial(jax.jit, static_argnames="expected")
-def rows_at(model: Model, point: Where, expected: bool) -> tuple[Linearised, ...]:
-    """All rows linearised at a point."""
+@jax.jit
+def rows_at(model: Model, point: Where, expected: Any) -> tuple[Linearised, ...]:
+    """All rows linearised at a point, a kernel for step weights and for the expected information."""
     return model.linearise(point, expected=expected)
 
 
@@ -395,6 +396,7 @@ class _Search(NamedTuple):
     over: jax.Array
 
 
+@quiet
 def find_mode(
     model: Model, start: Point, prior: Precision, iterations: int, tolerance: Any, *, joint: bool = True,
     once: bool = False, known: Eliminated | None = None,
@@ -444,6 +446,7 @@ class _Tracking(NamedTuple):
     iteration: jax.Array
 
 
+@quiet
 def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -> Point:
     """Trajectories at held biases until the cost of each changes by less than `tolerance`: iterated EKS by chords.
 

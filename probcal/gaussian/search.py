@@ -28,6 +28,9 @@ SMALL = 1e-9  # of the density: what no part of a step that promises less can sh
 NOTHING = 1e-4
 
 
+quiet = np.errstate(over="ignore", invalid="ignore")  # of the host: a number that is not finite is no better one
+
+
 class Objective(Protocol):
     """A negative log density of the biases, by expansions at points; these have a `point`."""
 
@@ -82,7 +85,7 @@ def search_step(objective: Objective, s: Search, at: Any, tolerance: Any) -> Sea
     return branch((s.share == 1) & ~s.done, partial(_directed, objective, tolerance), lambda s: s, s)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # a number that is not finite is no better one
+@quiet
 def climb_on_host(
     objective: Objective, start: Any, biases: int, iterations: int, tolerance: float,
     told: Callable[[int, float], bool] | None = None, search: Search | None = None,

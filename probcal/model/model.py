@@ -243,7 +243,7 @@ class Model(Stepwise):
             for b, (block, data, _, predicted) in enumerate(self.each_block(self.predict(at)))
         )
 
-    def linearise(self, at: Where, *, expected: bool) -> tuple[Linearised, ...]:
+    def linearise(self, at: Where, *, expected: Any) -> tuple[Linearised, ...]:
         """Every block linearised at a point, with step weights or the expected information.
 
         Raises `InputError` where a motion has no linear form.

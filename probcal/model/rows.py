@@ -474,16 +474,15 @@ def sample(
     return jnp.stack(drawn, 1)
 
 
-@partial(jax.jit, static_argnames=("block", "expected"))
 def linearise(
-    block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels: jax.Array, *, expected: bool
+    block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels: jax.Array, *, expected: Any
 ) -> Linearised:
     """Score, weight and Jacobians at one point; `expected` takes the information instead of the step weight."""
     return by_parts(lambda own: _linearised(block, own, states, z, levels, expected=expected), rows)
 
 
 def _linearised(
-    block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels: jax.Array, *, expected: bool
+    block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels: jax.Array, *, expected: Any
 ) -> Linearised:
     """What `linearise` gives of some rows."""
     local = read_biases(block, rows, z)
@@ -572,7 +571,7 @@ def square(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) ->
 
 
 def weigh(
-    block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array, *, expected: bool, extra: Any = None
+    block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array, *, expected: Any, extra: Any = None
 ) -> tuple[jax.Array, jax.Array]:
     """Score and step weight (or expected information) of every datum, zero where missing, both (N, C).
 
@@ -582,9 +581,12 @@ def weigh(
     if extra is not None:
         std = jnp.sqrt(std**2 + extra)
     score = rows.mask * _by_channel(block, families, "score", rows.y, predicted, std)
-    if expected:
-        return score, rows.mask * _information(block, rows, predicted, std, levels)
-    return score, rows.mask * _by_channel(block, families, "weight", rows.y, predicted, std)
+    ways = (
+        partial(_information, block, rows, predicted, std, levels),
+        partial(_by_channel, block, families, "weight", rows.y, predicted, std),
+    )
+    weight = jax.lax.cond(expected, *ways) if isinstance(expected, jax.core.Tracer) else ways[not expected]()
+    return score, rows.mask * weight
 
 
 def slopes(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> tuple[jax.Array, jax.Array]:

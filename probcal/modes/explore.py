@@ -17,7 +17,6 @@ import numpy as np
 from probcal.errors import FitError
 from probcal.gaussian.climb import climb_to_mode
 from probcal.gaussian.engine import Engine, Factors, evidence
-from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import Point, find_mode
 from probcal.labels import NODE, PIECE, SCENE
 from probcal.modes.grid import track_mode
@@ -92,7 +91,7 @@ class SideClimb(NamedTuple):
             return found.at.point, value
 
         if engine.cheap:
-            return cls(joint, lambda at, _: float(laplace(model, at, scales).evidence))
+            return cls(joint, lambda at, _: evidence(engine.at(model, at), scales, factors).value)
         return cls(marginal, lambda _, value: value, HELD)
 
 

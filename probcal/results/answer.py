@@ -16,9 +16,9 @@ import jax
 import numpy as np
 
 from probcal.gaussian.choose import engine_of
-from probcal.gaussian.engine import Expansion, Factors, Spread
+from probcal.gaussian.dense import DenseEngine
+from probcal.gaussian.engine import Expansion, Factors, Spread, evidence
 from probcal.gaussian.joint import blocks_of
-from probcal.gaussian.linearised import laplace
 from probcal.gaussian.mode import Point
 from probcal.modes.explore import Mirrored
 from probcal.modes.grid import track_mode
@@ -202,7 +202,8 @@ class Posterior:
         prior = self.prior.precision(self.problem.labels, self.problem.surveyed)
         alpha = jax.device_put(self.summary.precision)
         with jax.enable_x64(True):
-            return float(laplace(self.problem.model, self.point, prior._replace(alpha=alpha)).evidence)
+            at = DenseEngine().at(self.problem.model, self.point)
+            return evidence(at, prior._replace(alpha=alpha)).value
 
     @cached_property
     def before(self) -> Point:
