@@ -137,7 +137,7 @@ def log_density(model: Model, point: Point) -> jax.Array:
     return log_likelihood(model, point) - 0.5 * point.trajectories.square
 
 
-def _tilt(model: Model, point: Where) -> jax.Array:
+def _tilt(model: Model, point: Where) -> Any:
     """What the tilt of the model adds to the log density at a point."""
     return np.zeros(()) if model.tilt is None else model.tilt.value(point.z)
 
@@ -161,7 +161,7 @@ def mixed_density(model: Model, point: Point) -> jax.Array:
     return value
 
 
-def mixing_gain(model: Model) -> jax.Array:
+def mixing_gain(model: Model) -> Any:
     """What the evidence at the mean precisions lacks of its variational bound, the precisions uncertain.
 
     With q(trajectory) q(w), log p(data) is at least the evidence at E w and this sum (Ting, Theodorou, Schaal 2007).
@@ -174,7 +174,7 @@ def _mixing_gain(tail: Tail) -> jax.Array:
     return jnp.sum(jnp.where(tail.on, tail.family.mixing_gain(tail.weight, tail.size), 0.0))
 
 
-def widening(model: Model, levels: jax.Array) -> jax.Array:
+def widening(model: Model, levels: jax.Array) -> Any:
     """Log determinant by which the levels widen the noises that they multiply."""
     xp = library(levels, *jax.tree.leaves(model.recursions))
     levels, parts = xp.concatenate([xp.asarray(levels), np.zeros(1)]), list[Any]()
@@ -317,7 +317,7 @@ def _direction(solved: Eliminated, z: jax.Array, prior: Precision, damping: jax.
 
 def _proposal(
     model: Model, point: Point, prior: Precision, damping: jax.Array, joint: bool, solved: Eliminated
-) -> tuple[Point, jax.Array]:
+) -> tuple[Point, Any]:
     """Full Gauss-Newton step from a point eliminated there, and the decrease of the cost that it promises."""
     xp, dz, slope = library(point.z, damping), np.zeros(model.biases), 0.0
     if joint and model.biases:  # an arrowhead: the tip first, then the trajectories follow
@@ -391,7 +391,7 @@ class Mode(NamedTuple):
 
 class _Search(NamedTuple):
     mode: Mode  # so far
-    begun: jax.Array  # the cost at the start
+    begun: Any  # the cost at the start
     damping: jax.Array
     over: jax.Array
 
@@ -431,9 +431,15 @@ def find_mode(
         mode = Mode(point, value, count, converged, ~moved & ~converged, s.begun - value, before.volume)
         return _Search(mode, s.begun, damping, done | (count >= iterations) | (once & moved))
 
-    value, zero, no = cost(model, start, prior), np.zeros(()), np.zeros((), bool)
-    mode = Mode(start, value, np.zeros((), int), no, ~no, zero, zero)
+    value = cost(model, start, prior)
+    zero, none, no = _nothing()
+    mode = Mode(start, value, none, no, ~no, zero, zero)
     return repeated(lambda s: ~s.over, body, _Search(mode, value, zero, no | (iterations <= 0))).mode
+
+
+def _nothing() -> Any:
+    """Zero, no iteration, False: with these a search begins on the host and where it is traced."""
+    return np.zeros(()), np.zeros((), int), np.zeros((), bool)
 
 
 class _Tracking(NamedTuple):
@@ -476,9 +482,9 @@ def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -
         )  # fmt: skip
 
     xp = library(*jax.tree.leaves((model, start)))
-    parts, yes = None if xp is np else blank(at, start), np.ones((), bool)
+    parts, (zero, none, no) = None if xp is np else blank(at, start), _nothing()
     begun = xp.asarray(part_way(model, start, start, np.zeros(sum(model.targets)))[0])
-    first = _Tracking(start, begun, parts, yes, np.full((), np.inf), xp.ones(begun.shape, bool), np.zeros((), int))
+    first = _Tracking(start, begun, parts, ~no, zero + np.inf, xp.ones(begun.shape, bool), none)
     return repeated(lambda s: s.moving.any() & (s.iteration < iterations), body, first).point
 
 

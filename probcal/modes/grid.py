@@ -16,6 +16,7 @@ import numpy as np
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.mode import Point, apart, factors, gains_of, smooth_tracks
+from probcal.gaussian.search import quiet
 from probcal.model import variants
 from probcal.model.model import At, Model, Recursion
 from probcal.model.rows import Linearised
@@ -211,6 +212,7 @@ def follow_states(problem: Problem, states: list[np.ndarray]) -> Point:
     return project(problem, states, [np.full(x.shape, CLOSE * own) for x, own in zip(states, read, strict=True)])
 
 
+@quiet
 def grid_start(problem: Problem, z: Any = None, iterations: int = 30) -> Point:
     """Trajectories from the data alone at biases z (M,), as stated if None: grid, Viterbi path, motion, iterated EKS.
 
@@ -232,8 +234,7 @@ def grid_start(problem: Problem, z: Any = None, iterations: int = 30) -> Point:
             states = np.pad(path, ((0, 0), (span[0], problem.model.recursions[r].drift.shape[1] - span[1])))
         else:
             states = np.array(profile(problem.model, r, span, z, path)[1])
-        with np.errstate(over="ignore"):  # gaps of 1e-300 s
-            spread = np.sum(np.asarray(problem.model.recursions[r].L) ** 2, 2)
+        spread = np.sum(np.asarray(problem.model.recursions[r].L) ** 2, 2)
         precision = np.where(spread > 0, 1e4 / np.maximum(spread, 1e-300), 1e-9)
         for name, start, stop, _ in epochs.layout:
             if name == "position":

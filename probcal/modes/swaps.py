@@ -82,5 +82,5 @@ def exchanged(problem: Problem, tracked: Point, point: Point, settled: bool) -> 
 def best_fitting(problem: Problem, points: Sequence[Point]) -> list[tuple[float, Point]]:
     """Points and their joint costs under a flat prior, those first that fit best."""
     flat = Precision(jnp.zeros(len(problem.labels)))
-    costs = np.nan_to_num([float(joint_cost(problem.model, point, flat)) for point in points], nan=np.inf)
+    costs = np.nan_to_num([float(cost(problem.model, point, flat)) for point in points], nan=np.inf)
     return sorted(zip(costs.tolist(), points, strict=True), key=operator.itemgetter(0))
