@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -244,7 +245,7 @@ def simulate(
         seed = jax.random.split(jax.random.fold_in(keys[2], b), 3)
         drawn = np.array(_drawn(block, data, states[r], z, np.zeros(len(problem.levels)), seed[0]))
         drawn = _spoil(block, data, drawn, outliers, outlier_scale, seed[1])
-        gone = np.asarray(jax.random.uniform(seed[2], drawn.shape)) < missing
+        gone = _random(jax.random.uniform, seed[2], drawn.shape) < missing
         for c, (name, channel) in enumerate(block.type.expand(network.dimension)):
             columns[name][index] = np.where(gone[:, c], np.nan, channel.turned(drawn[:, c]))
     table = plan[["time", "sensor", *(["target"] if "target" in plan else [])]].assign(**columns)
@@ -259,6 +260,12 @@ def simulate(
     track = track[["time", "target", *(c for c in track.columns if c not in ("time", "target"))]]
     track = track[track["target"] != NOBODY].reset_index(drop=True)
     return Simulation(table, Truth(track, dict(zip(problem.labels, (z * problem.scales).tolist(), strict=True))))
+
+
+def _random(law: Callable[..., jax.Array], key: jax.Array, shape: tuple[int, ...]) -> np.ndarray:
+    """Numbers of a law in a shape: the first of a power of two, so that few sizes are compiled."""
+    size = math.prod(shape)
+    return np.array(law(key, (max(256, 1 << (size - 1).bit_length()),)))[:size].reshape(shape)
 
 
 def _detections(
@@ -340,8 +347,8 @@ def _legal(channel: Channel) -> float:
 def _biases(problem: Problem, share: float, given: Mapping[str, float] | None, key: jax.Array) -> np.ndarray:
     draw, chosen = jax.random.split(key)
     shape = (len(problem.labels),)
-    z = np.array(jax.random.normal(draw, shape))
-    zero = np.asarray(jax.random.uniform(chosen, shape)) >= share
+    z = _random(jax.random.normal, draw, shape)
+    zero = _random(jax.random.uniform, chosen, shape) >= share
     z[zero & np.array([bias.kind == "scale" and bias.zeros != "none" for bias in problem.biases], bool)] = 0.0
     if given is not None:
         z[:] = 0.0
@@ -427,8 +434,8 @@ def _spoil(
 ) -> np.ndarray:
     """What sensors report, outliers put on a share of it: more noise, or the wrong answer of a yes-or-no channel."""
     pick, size = jax.random.split(key)
-    hit = np.asarray(jax.random.uniform(pick, value.shape)) < share
-    extra = scale * np.asarray(data.std) * np.asarray(jax.random.normal(size, value.shape))
+    hit = _random(jax.random.uniform, pick, value.shape) < share
+    extra = scale * np.asarray(data.std) * _random(jax.random.normal, size, value.shape)
     for c, channel in enumerate(block.channels):
         wrong = 1 - value[:, c] if isinstance(channel.noise, Bernoulli) else value[:, c] + extra[:, c]
         value[:, c] = np.where(hit[:, c], wrong, value[:, c])

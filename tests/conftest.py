@@ -24,7 +24,7 @@ from probcal.gaussian import choose
 from probcal.wings import WingMissing, installed
 
 BUDGET = 5000  # kernels of a whole default run, all workers together (some 4000, by which takes which file)
-MOST_MAPS = 20_000  # memory maps of a process, which may have 65530: past them XLA fails without a word
+kernels.SHARE = 0.6  # of the memory maps that a process may have: a test needs less than the rest
 KERNELS = Path(__file__).parents[1] / ".pytest_cache" / "kernels"
 MOST_BYTES = 1_000_000_000  # of kernels kept there
 TOGETHER = {  # files that share worlds run in one worker, one after the other; these begin, the longest first
@@ -188,9 +188,7 @@ def severe_numerics():
 def few_maps():
     """Every compiled kernel takes memory maps, of which a process has a limited number."""
     yield
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
-        jax.clear_caches()
+    kernels.drop_if_many()
 
 
 @pytest.fixture

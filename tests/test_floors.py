@@ -2,6 +2,7 @@
 
 import ast
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -41,6 +42,7 @@ SHARED = tuple(
     )
 )  # fmt: skip  # what they share: it knows none of them
 LATER = {"pandas", "xarray"}  # loaded where a name of them is first used
+OUTSIDE = {"models", "tests", "benchmarks"}
 LOW = {"jax", "numpy", "filelock", "platformdirs"}  # third parties of floor 0, besides the standard library
 FACTORISE = {
     "cho_factor", "cho_solve", "cholesky", "eigh", "eig", "eigvalsh", "inv", "lu", "lu_factor", "lu_solve",
@@ -59,6 +61,11 @@ def dotted(path):
 MODULES = {dotted(path): path for path in FILES}
 
 
+@cache
+def parsed(path):
+    return ast.parse(path.read_text())
+
+
 def imports(tree, module, package):
     """Absolute names of everything imported anywhere in a module, with `name` of `from ... import name`."""
     for node in ast.walk(tree):
@@ -75,7 +82,7 @@ def imports(tree, module, package):
 
 def own(module, path):
     """Modules of probcal that a module imports, with the line."""
-    for name, line in imports(ast.parse(path.read_text()), module, path.name == "__init__.py"):
+    for name, line in imports(parsed(path), module, path.name == "__init__.py"):
         if name.split(".")[0] != "probcal":
             continue
         parts = name.split(".")[1:]
@@ -101,54 +108,57 @@ def test_imports_inside_functions_and_relative_ones_are_seen():
     assert found == ["probcal.problem.Epochs", "probcal.cli", "probcal.gaussian.mode"]
 
 
-@pytest.mark.parametrize("module", [m for m in MODULES if m], ids=str)
-def test_every_module_has_a_floor(module):
-    assert floor(module) is not None, (
-        f"probcal/{module.replace('.', '/')} is on no floor:"
-        " add it to FLOORS in tests/test_floors.py (design, section 4)"
-    )
+def test_every_module_has_a_floor():
+    without = [module for module in MODULES if module and floor(module) is None]
+    assert not without, f"{without} are on no floor: add them to FLOORS in tests/test_floors.py (design, section 4)"
 
 
-@pytest.mark.parametrize("module", [m for m in MODULES if m], ids=str)
-def test_imports_keep_the_floors(module):
+def test_imports_keep_the_floors():
     high = [
-        f"line {line}: imports {name or 'probcal itself'} (floor {floor(name) if name else 'of everything'})"
+        f"{module} (floor {floor(module)}), line {line}: imports {name or 'probcal'} (floor {floor(name)})"
+        for module in filter(None, MODULES)
         for name, line in own(module, MODULES[module])
         if not name or (floor(name) is not None and floor(name) > floor(module) and not wing(name))  # wings: below
     ]
-    assert not high, f"{module} is on floor {floor(module)}, {'; '.join(high)}"
+    assert not high, "\n".join(high)
 
 
 def wing(module):
     return module.split(".")[0] if module.split(".")[0] in WINGS else ""
 
 
-BETWEEN = set[tuple[str, str]]()  # wings that may import another
+def wings_of(module):
+    """Wings of which a module imports or names something, with the line."""
+    found = {(wing(module), wing(name), line) for name, line in own(module, MODULES[module]) if wing(name)}
+    if module in ("", "plots"):
+        block = next(node for node in parsed(MODULES[module]).body if isinstance(node, ast.If))
+        assert ast.unparse(block.test) == "TYPE_CHECKING"
+        found = {one for one in found if not block.lineno <= one[2] <= block.end_lineno}
+    if module != "wings":
+        texts = [(node.value, node.lineno) for node in ast.walk(parsed(MODULES[module]))
+                 if isinstance(node, ast.Constant) and str(node.value).removeprefix("probcal.") in MODULES]  # fmt: skip
+        found |= {(wing(module), wing(name[8:]), line) for name, line in texts if wing(name[8:])}
+    return [f"{module or 'probcal'}, line {line}: {other}" for here, other, line in found if here != other]
 
 
-@pytest.mark.parametrize("module", MODULES, ids=lambda m: m or "probcal")
-def test_no_wing_is_imported_by_the_core_nor_by_another(module):
+def test_no_wing_is_imported_by_the_core_nor_by_another():
     """Imports in functions and for type checkers count, and modules that are named in a text.
 
     The public names of two packages state those of wings for type checkers.
     """
-    found = {(wing(module), wing(name), line) for name, line in own(module, MODULES[module]) if wing(name)}
-    if module in ("", "plots"):
-        block = next(node for node in ast.parse(MODULES[module].read_text()).body if isinstance(node, ast.If))
-        assert ast.unparse(block.test) == "TYPE_CHECKING"
-        found = {one for one in found if not block.lineno <= one[2] <= block.end_lineno}
-    if module != "wings":
-        texts = [(node.value, node.lineno) for node in ast.walk(ast.parse(MODULES[module].read_text()))
-                 if isinstance(node, ast.Constant) and str(node.value).removeprefix("probcal.") in MODULES]  # fmt: skip
-        found |= {(wing(module), wing(name[8:]), line) for name, line in texts if wing(name[8:])}
-    others = [f"line {line}: {other}" for here, other, line in found if here != other and (here, other) not in BETWEEN]
-    assert not others, f"{module or 'probcal'} imports a wing, {'; '.join(others)}: reach it by name (probcal/wings.py)"
+    others = [text for module in MODULES for text in wings_of(module)]
+    assert not others, f"a wing is imported: reach it by name (probcal/wings.py)\n{'\n'.join(others)}"
 
 
-@pytest.mark.parametrize("module", [name for name in METHODS + SHARED if name in MODULES])
-def test_algorithms_do_not_import_each_other_nor_does_what_they_share(module):
-    others = [name for name, _ in own(module, MODULES[module]) if name in METHODS and name != module]
-    assert not others, f"{module} imports {others}: move what they share to a module of its own"
+def test_algorithms_do_not_import_each_other_nor_does_what_they_share():
+    others = [
+        (module, name)
+        for module in METHODS + SHARED
+        if module in MODULES
+        for name, _ in own(module, MODULES[module])
+        if name in METHODS and name != module
+    ]
+    assert not others, f"{others}: move what they share to a module of its own"
 
 
 def test_every_method_is_listed():
@@ -158,27 +168,27 @@ def test_every_method_is_listed():
     assert homes == listed
 
 
-@pytest.mark.parametrize("module", FLOORS[0])
-def test_the_ground_floor_needs_jax_and_numpy_only(module):
-    roots = {name.split(".")[0] for name, _ in imports(ast.parse(MODULES[module].read_text()), module, False)}
-    third = roots - sys.stdlib_module_names
-    assert third <= LOW | {"probcal"} | (LATER if module == "lazy" else set())
+def roots(path, module=""):
+    """First names of what a file imports."""
+    return {name.split(".")[0] for name, _ in imports(parsed(path), module, False)}
 
 
-@pytest.mark.parametrize("module", [m for m in MODULES if m], ids=str)
-def test_models_are_never_imported(module):
-    names = [name for name, _ in imports(ast.parse(MODULES[module].read_text()), module, False)]
-    assert not [name for name in names if name.split(".")[0] in ("models", "tests", "benchmarks")]
+def test_the_ground_floor_needs_jax_and_numpy_only():
+    third = {
+        module: roots(MODULES[module], module) - sys.stdlib_module_names - LOW - {"probcal"} for module in FLOORS[0]
+    }
+    assert third.pop("lazy") == LATER
+    assert not any(third.values()), third
 
 
-TESTS = sorted(Path(__file__).parent.glob("*.py"))
+def test_models_are_never_imported():
+    assert not [module for module in filter(None, MODULES) if roots(MODULES[module], module) & OUTSIDE]
 
 
-@pytest.mark.parametrize("path", TESTS, ids=lambda path: path.stem)
-def test_no_test_module_is_imported(path):
+def test_no_test_module_is_imported():
     """What tests share stands in modules of its own: worlds, contracts, reference and the like."""
-    names = {name.split(".")[0] for name, _ in imports(ast.parse(path.read_text()), "", False)}
-    assert not [name for name in names if name.startswith("test_")]
+    found = {path.stem: roots(path) for path in Path(__file__).parent.glob("*.py")}
+    assert not {name for name, used in found.items() if any(root.startswith("test_") for root in used)}
 
 
 def test_the_catalogue_uses_the_public_declaration_only():
@@ -245,16 +255,16 @@ def test_the_search_for_factorisations_spares(text):
     assert not factorisations(text)
 
 
-@pytest.mark.parametrize("module", [m for m in MODULES if m != "linalg"], ids=lambda m: m or "probcal")
-def test_only_linalg_factorises(module):
+def test_only_linalg_factorises():
     """By NumPy `gaussian/` does too, and what a report loads, which does without jax."""
-    free = module.startswith(("gaussian.", "results."))
     found = [
-        f"line {line}: {name}"
+        f"{module}, line {line}: {name}"
+        for module in MODULES
+        if module != "linalg"
         for name, line in factorisations(MODULES[module].read_text())
-        if not (name.startswith("numpy") and free)
+        if not (name.startswith("numpy") and module.startswith(("gaussian.", "results.")))
     ]
-    assert not found, f"{module}: {'; '.join(found)}: factorisations belong into linalg.py"
+    assert not found, f"factorisations belong into linalg.py\n{'\n'.join(found)}"
 
 
 @pytest.mark.needs(*WINGS)
@@ -273,7 +283,7 @@ def test_a_public_name_is_defined_once():
     """One word, one meaning: a second class or function of a name needs another name, or a line in `BY_MODULE`."""
     found = dict[str, list[str]]()
     for path in sorted(ROOT.rglob("*.py")):
-        for node in ast.parse(path.read_text()).body:
+        for node in parsed(path).body:
             if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
                 found.setdefault(node.name, []).append(path.stem)
     assert {name for name, files in found.items() if len(files) > 1} == BY_MODULE

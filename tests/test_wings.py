@@ -1,9 +1,9 @@
 """The core imports no wing, and does without each: what it leaves out, and what it says."""
 
+import json
 import os
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -14,76 +14,77 @@ from probcal.status import Status
 from probcal.wings import COMMANDS, METHODS, NAMES, PARTS, PICTURES, WINGS, WingMissing, installed, loaded
 
 ALONE = """
-import contextlib, importlib, io, pkgutil, sys
+import contextlib, importlib, io, json, pkgutil, sys
 import numpy as np
 import pytest
-import probcal as pc
-from probcal import sensors
-from probcal.cli import main
 def said(*words):
     sys.argv = ["probcal", *words]
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), contextlib.suppress(SystemExit):
-        main()
+        importlib.import_module("probcal.cli").main()
     return " ".join((out.getvalue() + err.getvalue()).split())
-for module in pkgutil.walk_packages(pc.__path__, "probcal."):
-    if not module.name.endswith("__main__"):
-        importlib.import_module(module.name)
-nodes = [pc.Node(name, place, scale={"position": 1.0}) for name, place in (("a", (0, 0)), ("b", (9, 0)), ("c", (0, 9)))]
-network, motion = pc.Network([sensors.ranger.on(node) for node in nodes]), pc.ConstantVelocity(1.0)
-path = np.stack([np.linspace(1, 8, 8), np.linspace(2, 5, 8)], 1)
-run = pc.simulate(network, motion, np.arange(8.0), key=1, tracks={"t": path})
-print(pc.__file__, pc.fit(pc.Problem(network, motion, run.table), pc.EA()).attrs["status"])
-print(*pc.__all__, *pc.plots.__all__, said("--help"))
-for words in ORDERS:
-    print(said(*words))
-sys.exit(pytest.main(TESTS))
+for folder, orders in ORDERS.items():
+    for name in [*sys.modules]:
+        if name.split(".")[0] == "probcal" or str(getattr(sys.modules[name], "__file__", "")).startswith(TESTS):
+            del sys.modules[name]
+    sys.path.insert(0, folder)
+    pc = importlib.import_module("probcal")
+    for module in pkgutil.walk_packages(pc.__path__, "probcal."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+    names = [*pc.__all__, *pc.plots.__all__, *said("--help").split()]
+    found = {"file": pc.__file__, "names": names, "said": [said(*words) for words in orders]}
+    if len(orders) == MOST:
+        places = {"a": (0, 0), "b": (9, 0), "c": (0, 9)}
+        nodes = [pc.Node(name, place, scale={"position": 1.0}) for name, place in places.items()]
+        network, motion = pc.Network([pc.sensors.ranger.on(node) for node in nodes]), pc.ConstantVelocity(1.0)
+        path = np.stack([np.linspace(1, 8, 8), np.linspace(2, 5, 8)], 1)
+        run = pc.simulate(network, motion, np.arange(8.0), key=1, tracks={"t": path})
+        found["status"] = pc.fit(pc.Problem(network, motion, run.table), pc.EA()).attrs["status"]
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        found["collected"] = int(pytest.main([TESTS, *QUICKLY])), out.getvalue()[-3000:]
+    print(json.dumps(found), flush=True)
+    sys.path.remove(folder)
 """
 
 
-def of(module, wing):
-    return module.split(".")[1] == wing
+def of(module, wings):
+    return module.split(".")[1] in wings
 
 
-def orders_of(wing):
-    """Commands that ask for what a wing gives, each with the name that is said to be missing."""
-    commands = {f"probcal {name}": (name, "--what", "ever") for name, home in COMMANDS.items() if of(home, wing)}
-    return commands | {name: ("fit", "m.py", "--method", name) for name, home in METHODS.items() if of(home, wing)}
-
-
-def alone(wing, folder):
-    """All that is left without a wing is imported, says its help, fits, and collects its tests."""
-    environment = os.environ | {"PYTHONPATH": str(package_without(folder, wing))}
-    quickly = ["--collect-only", "-qq", "-n", "0", "-p", "no:cacheprovider", "--assert=plain"]
-    tests = [str(ROOT / "tests"), "-c", str(ROOT / "pyproject.toml"), *quickly]
-    code = ALONE.replace("ORDERS", repr([*orders_of(wing).values()])).replace("TESTS", repr(tests))
-    return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=folder, env=environment, check=False,
-        timeout=900,
-    )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory):
-    """The package without each wing and its process, two at a time."""
-    pool, folders = ThreadPoolExecutor(2), {wing: tmp_path_factory.mktemp(wing) for wing in WINGS}
-    yield {wing: (folder, pool.submit(alone, wing, folder)) for wing, folder in folders.items()}
-    pool.shutdown(cancel_futures=True)
+def orders_of(wings):
+    """Commands that ask for what wings give, by the name that is said to be missing and its wing."""
+    asked = {f"probcal {name}": (home, (name, "--what", "ever")) for name, home in COMMANDS.items()}
+    asked |= {name: (home, ("fit", "m.py", "--method", name)) for name, home in METHODS.items()}
+    return {(name, home.split(".")[1]): words for name, (home, words) in asked.items() if of(home, wings)}
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("wing", WINGS)
-def test_the_core_does_without_a_wing(wing, runs):
-    folder, run = runs[wing]
-    done, missing = run.result(), orders_of(wing)
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    where, names, *sentences = done.stdout.splitlines()[: 2 + len(missing)]
-    assert where.split()[0] == str(folder / "probcal" / "__init__.py")
-    assert where.removeprefix(where.split()[0] + " ") in set(Status)
-    gone = {name for home, own in {**NAMES, **PICTURES}.items() if of(home, wing) for name in own.split()}
-    assert not {*gone, *(name for name, home in COMMANDS.items() if of(home, wing))} & set(names.split())
-    for name, sentence in zip(missing, sentences, strict=True):
-        assert sentence == f"probcal: {name} needs the folder probcal/{wing}, which is not installed"
+def test_the_core_does_without_each_wing_and_without_all(tmp_path):
+    """What is left is imported, says its help and collects its tests; without any wing it fits."""
+    without = {tmp_path / wing: [wing] for wing in WINGS} | {tmp_path / "all": [*WINGS]}
+    orders = {str(package_without(folder, *wings)): orders_of(wings) for folder, wings in without.items()}
+    settings = ["-c", str(ROOT / "pyproject.toml")]
+    quickly = ["--collect-only", "-qq", "-n0", "-pno:cacheprovider", "--assert=plain"]
+    given = {
+        "ORDERS": {folder: [*own.values()] for folder, own in orders.items()},
+        "TESTS": str(ROOT / "tests"), "QUICKLY": settings + quickly, "MOST": max(map(len, orders.values())),
+    }  # fmt: skip
+    code = "".join(f"{name} = {value!r}\n" for name, value in given.items()) + ALONE
+    run = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False, timeout=900,
+        env=os.environ | {"PYTHONPATH": ""},
+    )  # fmt: skip
+    assert run.returncode == 0, run.stdout[-3000:] + run.stderr[-3000:]
+    for (folder, own), wings, line in zip(orders.items(), without.values(), run.stdout.splitlines(), strict=True):
+        found = json.loads(line)
+        assert found["file"] == f"{folder}/probcal/__init__.py"
+        assert found["collected"][0] == 0, (wings, found["collected"][1])
+        gone = {name for home, names in {**NAMES, **PICTURES}.items() if of(home, wings) for name in names.split()}
+        assert not {*gone, *(name for name, home in COMMANDS.items() if of(home, wings))} & set(found["names"])
+        for (name, wing), sentence in zip(own, found["said"], strict=True):
+            assert sentence == f"probcal: {name} needs the folder probcal/{wing}, which is not installed"
+    assert found["status"] in set(Status)
 
 
 def test_what_is_of_a_wing_that_is_missing_says_so(monkeypatch):

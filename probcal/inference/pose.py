@@ -157,7 +157,7 @@ def pose(
             break
         draws = found.theta
         frame = moved(model, posed.frame, draws, keys[2])
-        if not all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(frame)):
+        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(frame)):
             break
         posed = posed._replace(frame=frame)
     assert best is not None
