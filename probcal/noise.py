@@ -373,8 +373,8 @@ def _information_of(family: AdditiveNoise) -> float:
     """Mean square of a family's score at std 1; points are even in asinh, so that tails of any weight are reached."""
     t = np.linspace(-FARTHEST, FARTHEST, 20_001)
     with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        e = jnp.asarray(np.sinh(t))
-        density, slope = np.exp(np.asarray(family.log_density(e))), np.asarray(family._slope(e))
+        e = np.sinh(t)
+        density, slope = np.exp(np.asarray(jax.jit(family.log_density)(e))), np.asarray(jax.jit(family._slope)(e))
     inside = density > 0
     return float(np.trapezoid(np.where(inside, slope**2 * density * np.cosh(t), 0.0), t))
 
@@ -394,9 +394,7 @@ def normal_scores(family: Any) -> tuple[np.ndarray, np.ndarray]:
     if isinstance(family, Normal | Heard):
         return e, e
     with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        points = jnp.asarray(e)
-        none = jnp.zeros_like(points)
-        density = np.exp(np.asarray(family.log_likelihood(points, none, jnp.ones_like(points), None)))
+        density = np.exp(np.asarray(jax.jit(family.log_likelihood)(e, np.zeros_like(e), np.ones_like(e), None)))
     mass = density * np.cosh(t)
     below = np.concatenate([[0.0], np.cumsum(0.5 * (mass[1:] + mass[:-1]))])
     above = np.concatenate([np.cumsum((0.5 * (mass[1:] + mass[:-1]))[::-1])[::-1], [0.0]])
@@ -412,9 +410,7 @@ def _rejects(family: Any) -> float:
 
     e, score = normal_scores(family)
     with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        points = jnp.asarray(e)
-        none = jnp.zeros_like(points)
-        low = np.asarray(family.reliance(points, none, none + 1.0, None)) < HALF
+        low = np.asarray(jax.jit(family.reliance)(e, np.zeros_like(e), np.ones_like(e), None)) < HALF
     return float(np.diff(special.ndtr(score)) @ (0.5 * low[1:] + 0.5 * low[:-1]))
 
 
@@ -465,7 +461,7 @@ class Normal(AdditiveNoise):
 def _level_moments(family: AdditiveNoise) -> tuple[float, float]:
     """Expected square of the derivative l of a log density by log std, and of its product with the score, at std 1."""
     with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        found = _moments(family, jnp.sinh(np.linspace(-FARTHEST, FARTHEST, 20_001)))
+        found = jax.jit(_moments, static_argnums=0)(family, np.sinh(np.linspace(-FARTHEST, FARTHEST, 20_001)))
     return float(found[0]), float(found[1])
 
 
@@ -757,7 +753,7 @@ class Mixture(AdditiveNoise):
         wide = self.scale * (inner if self.late == NORMAL else np.linspace(0.0, 40.0, 20_001))
         r = np.union1d(np.append(inner, self.delay + inner), self.delay + wide)
         with jax.enable_x64(True), jax.ensure_compile_time_eval():
-            density, slope = (np.asarray(part) for part in (self.log_density(r), self._slope(r)))
+            density, slope = (np.asarray(jax.jit(part)(r)) for part in (self.log_density, self._slope))
         return float(np.trapezoid(slope**2 * np.exp(density), r))
 
     def unit_information(self) -> Any:

@@ -133,7 +133,7 @@ def test_recursion(d, ratio, together, walk):
     rows = system(d, ratio, together, walk)
     expected = reference(*rows)
     with jax.enable_x64(True):
-        found = jax.tree.map(np.asarray, recursion(*map(jnp.asarray, rows)))
+        found = jax.tree.map(np.asarray, recursion(*rows))
     sd = np.sqrt(np.diagonal(expected["covariances"], axis1=1, axis2=2))
     width = np.sqrt(np.diagonal(np.linalg.inv((expected["information"] + np.eye(d + 2)).astype(float))))
     units = {

@@ -71,7 +71,7 @@ def test_a_wider_process_noise_costs_its_logarithm_and_leaves_the_trajectory_alo
         again = trajectory(part.F, factors(part, there.levels), part.drift[:, :, None], there.noises[0][:, :, None])
         np.testing.assert_allclose(again[:, :, 0], states)
         prior = Precision(np.ones(1))
-        change = cost(problem.model, there, prior) - cost(problem.model, here, prior)
+        change = np.subtract(*(jax.jit(cost)(problem.model, at, prior) for at in (there, here)))
     wider = 4 * 0.3 + 0.5 * (np.exp(-0.6) - 1) * np.sum(noises[1] ** 2)
     assert float(change) == pytest.approx(wider + 0.5 * (0.3 / np.log(2.0)) ** 2)
 
@@ -105,7 +105,7 @@ def test_a_row_with_a_std_of_its_own_does_not_feel_the_unknown_level():
     (rows,) = Problem(network, ConstantVelocity(0.5), table).model.rows
     assert rows.level.ravel().tolist() == [1, 0], "one level: its number is 0, and 1 stands for none"
     with jax.enable_x64(True):
-        found = noise_std(rows, jnp.log(jnp.array([3.0])))
+        found = jax.jit(noise_std)(rows, np.log([3.0]))
     np.testing.assert_allclose(found.ravel(), [0.5, 6.0], rtol=1e-6)
 
 
@@ -153,9 +153,10 @@ def test_an_unknown_level_moves_as_far_as_its_prior_lets_it(factor, least, most)
     problem = Problem(network, ConstantVelocity(0.01), table)
     with jax.enable_x64(True):
         point = find_mode(problem.model, resting(problem), Precision(jnp.ones(1)), 30, 1e-9).point
-        stds = [np.asarray(problem.model.noise_std(jnp.full(1, level))[0]) for level in (0.0, 0.5)]
+        std = jax.jit(lambda level: problem.model.noise_std(level)[0])
+        stds = [np.asarray(std(np.full(1, level))) for level in (0.0, 0.5)]
         variances = Variances.dense(DenseEngine().at(problem.model, point), jnp.eye(1))
-        moved = float(update_levels(problem.model, point, *variances).levels[0])
+        moved = float(jax.jit(lambda *own: update_levels(problem.model, *own).levels[0])(point, *variances))
     np.testing.assert_allclose(stds[1], np.exp(0.5) * stds[0])
     assert least < moved < most
 

@@ -65,7 +65,7 @@ def mixture(prior, matrix=G, pull=PULL, group=(0, 1, 2), key=0):
     """The mixture by Gibbs sweeps: moments and draws."""
     form = Form(3, kind_of(prior, group))
     with jax.enable_x64(True):
-        known = Natural(jnp.asarray(matrix), jnp.asarray(pull), jnp.zeros(0), Precision(jnp.ones(3)))
+        known = Natural(np.asarray(matrix), np.asarray(pull), np.zeros(0), Precision(np.ones(3)))
         _, swept = run_sweeps(form, known, begin(form), jax.random.key(key), KEPT)
         found = jax.tree.map(np.asarray, moments(form, known, swept.phi))
         return found, np.asarray(swept.z), np.asarray(swept.mean)
@@ -75,9 +75,14 @@ def weighed(prior):
     """The same by importance sampling: hyper-parameters from their prior, each weighed by its evidence."""
     kind = kind_of(prior)
     with jax.enable_x64(True):
-        phi = jax.vmap(kind.draw)(jax.random.split(jax.random.key(1), DRAWS))
-        alpha = np.asarray(jax.vmap(lambda one: kind.alpha(one, jnp.ones(3)))(phi))
-        active = np.asarray(jax.vmap(lambda one: kind.active(one, 3))(phi))
+
+        @jax.jit
+        @jax.vmap
+        def drawn(key):
+            phi = kind.draw(key)
+            return kind.alpha(phi, jnp.ones(3)), kind.active(phi, 3)
+
+        alpha, active = jax.tree.map(np.asarray, drawn(jax.random.split(jax.random.key(1), DRAWS)))
     alpha = np.where(active, alpha, 1e9)  # a spike
     covariance = np.linalg.inv(G + np.apply_along_axis(np.diag, 1, alpha))
     mean = covariance @ PULL

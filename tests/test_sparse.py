@@ -27,7 +27,7 @@ from probcal.gaussian.factor import Entries
 from probcal.gaussian.iterative import Iterative
 from probcal.gaussian.joint import JointPrecision, blocks_of
 from probcal.gaussian.linearised import linearise_rows
-from probcal.gaussian.mode import compress
+from probcal.gaussian.mode import Point, compress
 from probcal.gaussian.room import check_room
 from probcal.gaussian.superlu import SuperLU
 from probcal.geometry import bearing, norm
@@ -630,15 +630,15 @@ def test_what_a_screen_advises_removes_what_all_sensors_share():
     network, table = unanchored()
     problem = pc.Problem(network, MOTION["car"], table)
     with jax.enable_x64(True):
-        at = DenseEngine().at(problem.model, automatic_start(problem))
-        found = shared_directions(problem, at)
+        start = automatic_start(problem)
+        found = shared_directions(problem, DenseEngine().at(problem.model, start))
     assert [own.kind for own in found][:3] == ["gauge"] * 3  # two translations and a rotation
     advised = [own.fix for own in found]
     assert all(advised)
 
     def left(fixed):
         rest = pc.Problem(network, MOTION["car"], table, fix=[label for own in fixed for label in own])
-        return weak_of_all(pc.observability(rest))
+        return weak_of_all(pc.observability(rest, point=start._replace(z=np.zeros(len(rest.labels)))))
 
     assert not left(advised)
     assert left([advised[0]])
@@ -874,14 +874,13 @@ def test_what_planning_cannot_say_it_says(monkeypatch):
     way = np.stack([10.0 * TIME, 50.0 + 0 * TIME], 1)
     run = pc.simulate(network, pc.ConstantVelocity(1.0), TIME, key=1, tracks={"target": way})
     problem = pc.Problem(network, pc.ConstantVelocity(1.0), run.table)
-    with jax.enable_x64(True):
-        point = automatic_start(problem)
+    states = np.concatenate([way, np.tile([10.0, 0.0], (len(TIME), 1))], 1)
+    point = Point((states,), (np.zeros_like(states),), np.zeros(len(problem.labels)), np.zeros(0))
     with pytest.raises(InputError, match="pass 0 runs over the place of a sensor that has no derivative there"):
         pc.next_passes(problem, point=point, passes=[[(0.0, 0.0), (0.0, 0.0)]])
-    at = np.asarray(point.states[0])[3, slice(*problem.epochs[0].position)]
     with pytest.raises(InputError, match=r"a further naive at \(.*\) m would stand where a target was seen, and has"):
-        pc.next_sensors(problem, point=point, places=[at])
-    there = point._replace(states=(jnp.zeros_like(point.states[0]),))
+        pc.next_sensors(problem, point=point, places=[way[3]])
+    there = point._replace(states=(np.zeros_like(states),))
     with pytest.raises(InputError, match="no finite derivatives at the point where they are looked at"):
         pc.next_sensors(problem, point=there, places=[(5.0, 5.0)])
     for call, name, given in (

@@ -290,6 +290,7 @@ def late_by(block: Block, rows: Rows, z: np.ndarray) -> np.ndarray:
     return offset + rate * time
 
 
+@partial(jax.jit, static_argnames=("block", "seen"))
 def look(block: Block, rows: Rows, states: jax.Array, z: jax.Array, seen: Callable[..., Any]) -> jax.Array:
     """A function of target and pose(s), such as a field of view, at every row: (N, ...)."""
     local = read_biases(block, rows, z)

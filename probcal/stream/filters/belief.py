@@ -199,6 +199,7 @@ def walked(belief: Augmented, std: jax.Array) -> Augmented:
     return after._replace(slots=slots)
 
 
+@jax.jit
 def jumped(belief: Augmented, which: jax.Array, size: jax.Array, variance: jax.Array) -> Augmented:
     """The belief where candidate `which` did jump, by a size of mean and variance given by its data.
 
@@ -230,6 +231,7 @@ def jumped(belief: Augmented, which: jax.Array, size: jax.Array, variance: jax.A
     return Augmented(mean, root, tuple(slots), fresh)
 
 
+@jax.jit
 def renewed(belief: Augmented, columns: jax.Array) -> Augmented:
     """Candidates of some columns (C,) begin at this moment."""
     told = belief.candidates
