@@ -31,7 +31,8 @@ TOGETHER = {  # files that share worlds run in one worker, one after the other; 
     "test_exact.py": "linear", "test_methods.py": "linear", "test_samplers.py": "linear", "test_svi.py": "linear",
     "test_drift.py": "linear", "test_kernels.py": "linear", "test_metamorphic.py": "bent", "test_bounds.py": "bent",
     "test_degenerate.py": "linear", "test_sparse.py": "sparse", "test_segments.py": "sparse",
-    "test_notebooks.py": "notebooks", "test_kills.py": "kills", "test_endtoend.py": "end to end", "test_wings.py": "wings",
+    "test_notebooks.py": "notebooks", "test_kills.py": "kills", "test_endtoend.py": "commands",
+    "test_wings.py": "wings",
 }  # fmt: skip
 NEEDS = {  # the wings that all tests of a file need; it is not collected where one is missing
     "../README.md": "adapters doa particles roads rss stream studies tracking",

@@ -1,7 +1,7 @@
 """Studies: the same fits as one by one, and scenarios C1 and C2 against the figures of the trial (runs 0 to 7)."""
 
 import sys
-from copy import copy
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -109,18 +109,17 @@ def test_each_fit_of_a_study_is_that_of_fit_alone():
 
 @pytest.mark.ci
 def test_runs_that_survey_other_nodes_keep_their_own_priors():
-    def setting(run, share=0.3):
-        problem, truth = radars.setting(run, share=share, scenario="C1")
-        held = {f"radar_{k}.position_{axis}" for k in ((0, 1) if run % 2 else (2, 3)) for axis in "xy"}
-        surveyed = np.array([label in held for label in problem.labels])
-        assert surveyed.sum() == 4
-        problem = copy(problem)
-        problem.surveyed = surveyed
+    def setting(run, own=True):
+        problem, truth = heights(run)
+        problem.surveyed = np.arange(2) == (run if own else 0)
         return problem, truth
 
-    both = study(setting, {"share": [0.3]}, {"ea": EA()}, runs=[0, 1])
-    alone = study(setting, {"share": [0.3]}, {"ea": EA()}, runs=[1])
-    np.testing.assert_array_equal(both["sd"].sel(run=1), alone["sd"].sel(run=1))
+    both, alone, other = (
+        study(partial(setting, own=own), {}, {"ea": EA()}, runs=runs)["sd"].sel(run=1)
+        for own, runs in ((True, [0, 1]), (True, [1]), (False, [1]))
+    )
+    np.testing.assert_array_equal(both, alone)
+    assert (both != other).all()
 
 
 @pytest.mark.ci

@@ -209,7 +209,7 @@ def _of_some(
     model, read = variants.of_read(variants.split(passes.model.by_information(), pieces, len(some)))
     owner, bias = np.divmod(read, M)
     ends = np.searchsorted(owner, np.arange(len(some) + 1))
-    point = Point((along,), (jnp.zeros_like(along),), told.point.z[bias], told.levels(passes))
+    point = Point((along,), (jnp.zeros_like(along),), np.asarray(told.point.z)[bias], told.levels(passes))
     rows = linearise_rows(model, point)
     for *_, own, finite in model.each_block(pieces, _finite(rows)):
         if not finite.all():
@@ -241,7 +241,7 @@ def gains_of_sensors(told: Informed, kind: SensorType, places: np.ndarray) -> np
     wider, new = _with_sensor(told.problem, kind)
     number = {label: m for m, label in enumerate(told.problem.labels)}
     old = np.array([number.get(label, -1) for label in wider.labels], int)
-    z = jnp.where(old >= 0, jnp.append(told.point.z, 0.0)[old], 0.0)
+    z = np.where(old >= 0, np.append(told.point.z, 0.0)[old], 0.0)
     states = _states_at(told, wider)
     point = Point(states, tuple(jnp.zeros_like(x) for x in states), z, told.levels(wider))
     model, gains = wider.model.by_information(), np.zeros(len(places))

@@ -168,6 +168,7 @@ def not_estimated(belief: Augmented, kept: KeptDatum, considered: jax.Array) -> 
     return after._replace(slots=slots)
 
 
+@jax.jit
 def dispersed(
     belief: Augmented, slots: tuple[Slots, ...], columns: jax.Array, back: jax.Array | None = None
 ) -> tuple[Augmented, tuple[Slots, ...]]:
