@@ -374,7 +374,8 @@ def _information_of(family: AdditiveNoise) -> float:
     t = np.linspace(-FARTHEST, FARTHEST, 20_001)
     with jax.enable_x64(True), jax.ensure_compile_time_eval():
         e = np.sinh(t)
-        density, slope = np.exp(np.asarray(jax.jit(family.log_density)(e))), np.asarray(jax.jit(family._slope)(e))
+        log, slope = (np.asarray(jax.jit(law)(e)) for law in (family.log_density, family._slope))
+    density = np.exp(log)
     inside = density > 0
     return float(np.trapezoid(np.where(inside, slope**2 * density * np.cosh(t), 0.0), t))
 
@@ -394,7 +395,8 @@ def normal_scores(family: Any) -> tuple[np.ndarray, np.ndarray]:
     if isinstance(family, Normal | Heard):
         return e, e
     with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        density = np.exp(np.asarray(jax.jit(family.log_likelihood)(e, np.zeros_like(e), np.ones_like(e), None)))
+        log = jax.jit(family.log_likelihood)(e, np.zeros_like(e), np.ones_like(e), None)
+    density = np.exp(np.asarray(log))
     mass = density * np.cosh(t)
     below = np.concatenate([[0.0], np.cumsum(0.5 * (mass[1:] + mass[:-1]))])
     above = np.concatenate([np.cumsum((0.5 * (mass[1:] + mass[:-1]))[::-1])[::-1], [0.0]])
@@ -410,7 +412,8 @@ def _rejects(family: Any) -> float:
 
     e, score = normal_scores(family)
     with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        low = np.asarray(jax.jit(family.reliance)(e, np.zeros_like(e), np.ones_like(e), None)) < HALF
+        relied = jax.jit(family.reliance)(e, np.zeros_like(e), np.ones_like(e), None)
+    low = np.asarray(relied) < HALF
     return float(np.diff(special.ndtr(score)) @ (0.5 * low[1:] + 0.5 * low[:-1]))
 
 
@@ -460,8 +463,9 @@ class Normal(AdditiveNoise):
 @lru_cache
 def _level_moments(family: AdditiveNoise) -> tuple[float, float]:
     """Expected square of the derivative l of a log density by log std, and of its product with the score, at std 1."""
+    e = np.sinh(np.linspace(-FARTHEST, FARTHEST, 20_001))
     with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        found = jax.jit(_moments, static_argnums=0)(family, np.sinh(np.linspace(-FARTHEST, FARTHEST, 20_001)))
+        found = jax.jit(_moments, static_argnums=0)(family, e)
     return float(found[0]), float(found[1])
 
 
@@ -753,8 +757,8 @@ class Mixture(AdditiveNoise):
         wide = self.scale * (inner if self.late == NORMAL else np.linspace(0.0, 40.0, 20_001))
         r = np.union1d(np.append(inner, self.delay + inner), self.delay + wide)
         with jax.enable_x64(True), jax.ensure_compile_time_eval():
-            density, slope = (np.asarray(jax.jit(part)(r)) for part in (self.log_density, self._slope))
-        return float(np.trapezoid(slope**2 * np.exp(density), r))
+            log, slope = (np.asarray(jax.jit(law)(r)) for law in (self.log_density, self._slope))
+        return float(np.trapezoid(slope**2 * np.exp(log), r))
 
     def unit_information(self) -> Any:
         """Expected information at std 1."""

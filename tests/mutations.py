@@ -199,8 +199,8 @@ MUTATIONS = [
     Mutation("jnp.round(angle / period)", "jnp.floor(angle / period)", "test_catalogue.py"),
     Mutation("jnp.stack([norm(line[:2]), line[2]])", "jnp.stack([norm(line), line[2]])", "test_catalogue.py"),
     # priors.py
-    Mutation("+ 2 * self.rate + 1e-300", "+ self.rate + 1e-300", "test_formulas.py"),
-    Mutation("total(z**2 + variance)", "total(z**2)", "test_formulas.py"),
+    Mutation("+ 2 * self.rate + 1e-300", "+ self.rate + 1e-300", "test_methods.py"),
+    Mutation("total(z**2 + variance)", "total(z**2)", "test_methods.py"),
     Mutation("jnp.where(self.alpha > 0, self.alpha, 1.0))) + self.logdet", "jnp.where(self.alpha > 0, self.alpha, 1.0)))", "test_methods.py"),
     # inference/
     Mutation("alpha=jnp.where(fresh, state.alpha, alpha)", "alpha=alpha", "test_methods.py test_exact.py"),

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from worlds import exact, linear, resting, ruler
 
-from probcal import ARD, Channel, ConstantVelocity, Network, Node, Problem, Unknown, simulate
+from probcal import Channel, ConstantVelocity, Network, Node, Problem, Unknown, simulate
 from probcal.gaussian.dense import DenseEngine
 from probcal.gaussian.frame import _moves, _with_levels
 from probcal.gaussian.information import at_levels, update_levels
@@ -31,19 +31,6 @@ def test_an_undeclared_start_is_as_wide_as_network_and_recording():
     speed = 10 * 50.0 / 4.0 + 0.5 * 2.0
     np.testing.assert_allclose(np.diag(part.L[0]), [500.0, 500.0, speed, speed], rtol=1e-6)
     np.testing.assert_allclose(part.drift[0], [15.0, 20.0, 0.0, 0.0])
-
-
-@pytest.mark.parametrize(("shape", "rate"), [(1.0, 0.0), (2.0, 1.5)])
-def test_precisions_are_learnt_by_their_formulas(shape, rate):
-    """Paper B (25) and Paper C (40) with a Gamma hyper-prior, for biases that share a precision."""
-    gamma, variance, z = np.array([0.9, 0.5, 0.2]), np.array([0.1, 0.3, 0.7]), np.array([1.5, -0.4, 0.8])
-    group, more, less = np.array([0, 0, 2]), 2 * (shape - 1), 2 * rate
-    with jax.enable_x64(True):
-        mackay, em = (ARD(shape, rate).learn(gamma, variance, z, group, rule) for rule in ("mackay", "em"))
-    square, spread = z**2, z**2 + variance
-    for found, count, total in ((mackay, gamma, square), (em, np.ones(3), spread)):
-        shared = (count[:2].sum() + more) / (total[:2].sum() + less)
-        np.testing.assert_allclose(found, [shared, shared, (count[2] + more) / (total[2] + less)], rtol=1e-9)
 
 
 def test_a_bias_whose_chains_disagree_is_not_mixed():

@@ -443,7 +443,7 @@ def test_every_pair_of_prior_and_method_fits(name):
 def test_precisions_follow_from_what_was_found():
     """MacKay's rule and EM's, biases alone and in groups, with and without a hyper-prior, by hand; and l1's."""
     gamma, variance, z = np.array([0.9, 0.5, 0.1]), np.array([0.1, 0.5, 0.9]), np.array([2.0, -0.5, 0.1])
-    alone, pair = np.arange(3), np.array([0, 0, 1])
+    alone, pair = np.arange(3), np.array([0, 0, 2])
     with jax.enable_x64(True):
         for prior, group, shape, rate in (
             (ARD(), alone, 1.0, 0.0), (ARD(2.0, 1.5), alone, 2.0, 1.5), (ARD(by="node"), pair, 1.0, 0.0),

@@ -426,11 +426,11 @@ def test_em_by_particles_says_where_nothing_explains_the_rows():
 
 def test_later_rows_of_a_road_may_not_lie_further_apart():
     network = Network([relative.on(Node("known", (0.0, 0.0)))])
-    run = simulate(network, crossing("road"), TIME, key=1)
-    problem = Problem(network, crossing("road"), run.table[run.table["time"] < 6])
-    assert problem.later(run.table[run.table["time"] == 6]).time.shape == (1,)
+    table = pd.DataFrame({"time": TIME, "sensor": "known", "place_x": TIME, "place_y": 0.0})
+    problem = Problem(network, crossing("road"), table[table["time"] < 6])
+    assert problem.later(table[table["time"] == 6]).time.shape == (1,)
     with pytest.raises(InputError, match="later: 3 s pass between two epochs, more than the 1 s"):
-        problem.later(run.table[run.table["time"] == 8])
+        problem.later(table[table["time"] == 8])
 
 
 ERRORS = [

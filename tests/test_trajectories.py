@@ -66,7 +66,7 @@ def test_tracks_take_pytrees_of_arrays():
 def test_sums_by_target_are_those_of_loops(name):
     problem = problem_of(name)
     model, point = problem.model, drawn(problem)
-    sums = model.by_target(point.states)
+    sums = jax.jit(lambda states: model.by_target(states))(point.states)
     for r, part in enumerate(model.recursions):
         for t in range(model.targets[r]):
             whole = np.asarray(point.states[r])[np.asarray(part.target) == t].sum(0)
@@ -78,7 +78,8 @@ def test_states_are_those_that_noises_drive_one_epoch_after_the_other(name):
     problem = problem_of(name)
     model, levels = problem.model, np.full(len(problem.levels), 0.3)
     noises = drawn(problem).noises
-    for part, u, states in model.each_layout(noises, model.each(lambda p, u: driven_states(p, levels, u), noises)):
+    driven = jax.jit(lambda noises: model.each(lambda p, u: driven_states(p, levels, u), noises))
+    for part, u, states in model.each_layout(noises, driven(noises)):
         x, scale = np.zeros(u.shape[1]), np.append(np.exp(levels), 1.0)[np.asarray(part.level)]
         F, drift, L, u = (np.asarray(own) for own in (part.F, part.drift, part.L, u))
         for e in range(len(u)):

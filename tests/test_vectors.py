@@ -74,7 +74,7 @@ def evaluated(model, at):
 def compared(problem, x, z, formula):
     """Prediction and Jacobians of the one row at a state (n,) and biases z, against a formula of both."""
     with jax.enable_x64(True):
-        (found,), (lin,) = evaluated(problem.model, At((jnp.array(x)[None],), jnp.array(z), jnp.zeros(0)))
+        (found,), (lin,) = evaluated(problem.model, At((np.array(x)[None],), np.array(z), np.zeros(0)))
     np.testing.assert_allclose(np.asarray(found)[0], formula(x, z), rtol=1e-12)
     block, rows = problem.model.blocks[0], problem.model.rows[0]
     by_state, by_bias = difference(lambda s: formula(s, z), x), difference(lambda b: formula(x, b), z)

@@ -209,7 +209,8 @@ def _of_some(
     model, read = variants.of_read(variants.split(passes.model.by_information(), pieces, len(some)))
     owner, bias = np.divmod(read, M)
     ends = np.searchsorted(owner, np.arange(len(some) + 1))
-    point = Point((along,), (jnp.zeros_like(along),), np.asarray(told.point.z)[bias], told.levels(passes))
+    z, levels = np.asarray(told.point.z)[bias], told.levels(passes)
+    point = Point((along,), (jnp.zeros_like(along),), z, levels)
     rows = linearise_rows(model, point)
     for *_, own, finite in model.each_block(pieces, _finite(rows)):
         if not finite.all():
