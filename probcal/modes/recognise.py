@@ -124,33 +124,31 @@ def seen_directions(problem: Problem) -> list[Directions]:
     """
     known, data, found = kinds(problem), problem.measurements, []
     d = problem.network.dimension
+    families = ("azimuth", "elevation")[: d - 1]
     for k, sensor in enumerate(problem.network.sensors):
         if len(sensor.nodes) != 1 or sensor.nodes[0].path is not None:
             continue
-        own: dict[str, tuple[int, Kind, float, float]] = {}
+        own: dict[str, tuple[int, float, float, float, float]] = {}  # column, sign, shift, radians of its unit, std
         for name, channel in sensor.type.expand(d):
             kind = known.get((sensor.type.name, name))
-            if kind is not None and kind.family in ("azimuth", "elevation") and name in data.channels:
+            if kind is not None and name in data.channels:
                 unit = np.pi / 180 if channel.unit == "deg" else 1.0
-                own[kind.family] = (data.channels.index(name), kind, unit, guess_of(channel.std) * unit)
-        if "azimuth" not in own or (d == 3 and "elevation" not in own):
+                own[kind.family] = data.channels.index(name), kind.sign, kind.shift, unit, guess_of(channel.std)
+        if not own.keys() >= set(families):
             continue
+        column, sign, shift, unit, guess = (np.array(each) for each in zip(*map(own.get, families), strict=True))
+        there = (data.sensor == k) & data.measured[:, column].all(1) & (data.weight > 0)
         for t, target in enumerate(data.target_names):
-            columns = [own["azimuth"][0]] + ([own["elevation"][0]] if d == 3 else [])
-            told = data.measured[:, columns].all(1) & (data.weight > 0)
-            mine = np.flatnonzero((data.sensor == k) & (data.target == t) & told)
+            mine = np.flatnonzero(there & (data.target == t))
             if not len(mine):
                 continue
-            angles, stds = [], []
-            for family in ("azimuth", "elevation")[: len(columns)]:
-                j, kind, unit, guess = own[family]
-                angles.append((data.value[mine, j] * unit - kind.shift) * kind.sign)
-                stds.append(np.where(data.has_std[mine, j], data.std[mine, j] * unit, guess))
+            cells = np.ix_(mine, column)
             time, group = np.unique(data.time[mine], return_inverse=True)
-            count = np.bincount(group)
-            mean = [np.angle(np.bincount(group, np.cos(a)) + 1j * np.bincount(group, np.sin(a))) for a in angles]
-            spread = [np.bincount(group, s) / count for s in stds]
-            found.append(Directions(sensor.nodes[0].name, target, time, np.stack(mean, 1), np.stack(spread, 1)))
+            total, spread = np.zeros((len(time), len(column)), complex), np.zeros((len(time), len(column)))
+            np.add.at(total, group, np.exp(1j * (data.value[cells] * unit - shift) * sign))
+            np.add.at(spread, group, np.where(data.has_std[cells], data.std[cells], guess) * unit)
+            spread /= np.bincount(group)[:, None]
+            found.append(Directions(sensor.nodes[0].name, target, time, np.angle(total), spread))
     return found
 
 
