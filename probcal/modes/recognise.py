@@ -132,8 +132,8 @@ def seen_directions(problem: Problem) -> list[Directions]:
         for name, channel in sensor.type.expand(d):
             kind = known.get((sensor.type.name, name))
             if kind is not None and name in data.channels:
-                unit = np.pi / 180 if channel.unit == "deg" else 1.0
-                own[kind.family] = data.channels.index(name), kind.sign, kind.shift, unit, guess_of(channel.std)
+                turn = np.pi / 180 if channel.unit == "deg" else 1.0
+                own[kind.family] = data.channels.index(name), kind.sign, kind.shift, turn, guess_of(channel.std)
         if not own.keys() >= set(families):
             continue
         column, sign, shift, unit, guess = (np.array(each) for each in zip(*map(own.get, families), strict=True))
