@@ -114,8 +114,8 @@ def _of_noises(problem: Problem, r: int, found: dict[Level, int]) -> np.ndarray:
     """Level (E, n) of every whitened process noise of a recursion, starts left out."""
     epochs, part = problem.epochs[r], problem.model.recursions[r]
     first, index = np.asarray(part.first), np.full(part.drift.shape, -1)
-    for target, own in epochs.members.items():
-        mine = own & ~first
+    for target, members in epochs.members.items():
+        mine = members & ~first
         components = linear_of(as_motion(problem.target(target).motion))
         for component, _, own in by_component(components, problem.network.dimension):
             if mine.any() and not isinstance(component.std, Unknown):

@@ -76,14 +76,14 @@ def reflected_scenes(problem: Problem, point: Point, most: float = np.inf) -> It
         for biases, moved in ways:
             worse = list(map(np.subtract, _losses(problem, biases, point, plane), here))
             word = "" if biases is z else " and nodes"
-            for who, own in moved:
+            for who, chosen in moved:
                 loss, much = (
-                    sum(float(part[mine].sum()) for part, mine in zip(values, own, strict=True))
+                    sum(float(part[mine].sum()) for part, mine in zip(values, chosen, strict=True))
                     for values in (worse, counts)
                 )
                 if loss < WORSE * much:
                     way = f"{who}{word} reflected in {plane.name}"
-                    seen.append((loss / much, Candidate(way, SCENE, reflect(problem, point, plane, own, biases))))
+                    seen.append((loss / much, Candidate(way, SCENE, reflect(problem, point, plane, chosen, biases))))
     yield from (candidate for _, candidate in sorted(seen, key=lambda one: one[0]))
 
 
