@@ -37,7 +37,7 @@ from probcal.model.motions import (
     start_of,
     tails_of,
 )
-from probcal.model.padding import padded, repeated, roomy
+from probcal.model.padding import padded_index, padded_model, roomy
 from probcal.model.rows import Block, Rows, addresses, late_by, make_block, pose_entries, pose_vector
 from probcal.model.sampled import SampledMotion
 from probcal.model.variants import aligned, at_measured
@@ -75,7 +75,7 @@ class Epochs:
     @property
     def padded(self) -> Epochs:
         """The labels of the epochs and of those behind them that belong to no target."""
-        index, more = repeated(len(self.time)), np.arange(len(self.time), roomy(len(self.time)))
+        index, more = padded_index(len(self.time)), np.arange(len(self.time), roomy(len(self.time)))
         target = np.append(self.target, np.full(len(more), "", self.target.dtype))
         return replace(self, time=self.time[index], target=target, order=np.append(self.order, more))
 
@@ -315,9 +315,9 @@ class Problem:
         return self if self.roomy else self._with(roomy=True)._longer()
 
     def _longer(self) -> Problem:
-        self.model = jax.device_put(padded(jax.device_get(self.model)), may_alias=False)
+        self.model = jax.device_put(padded_model(jax.device_get(self.model)), may_alias=False)
         self.epochs = [own.padded for own in self.epochs]
-        self.row_index = [index[repeated(len(index))] for index in self.row_index]
+        self.row_index = [index[padded_index(len(index))] for index in self.row_index]
         return self
 
     @property

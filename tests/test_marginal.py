@@ -82,7 +82,7 @@ def test_on_a_linear_problem_it_is_the_joint_mode():
 def test_steps_are_halved_apart_and_none_is_taken_where_none_would_do():
     """Of three steps along (t - a)^2 the first is whole, the second an eighth; the third only rises."""
     valley, bound = np.array([0.5, 0.1, -1.0]), np.array([0.25, 0.01, 1.0])
-    share, value = map(np.asarray, jax.jit(lambda bound: halved(lambda t: (t - valley) ** 2, bound))(bound))
+    share, value, _ = jax.jit(lambda bound: halved(lambda t: ((t - valley) ** 2, t), bound))(bound)
     np.testing.assert_array_equal(share, [1.0, 0.125, 0.0])
     np.testing.assert_allclose(value, [0.25, 0.025**2, 1.0], rtol=1e-6)
     assert jax.jit(between)(1.0, np.nan, share[2]) == 1.0

@@ -23,7 +23,7 @@ def _looked(model, point):
             predicted = waist.predict.__wrapped__(block, data, states, z)  # no kernel of other tests
             return jnp.sum(waist.log_likelihood.__wrapped__(block, data, predicted, point.levels) ** 2)
 
-        lin = waist.linearise.__wrapped__(block, data, states, point.z, point.levels, expected=False)
+        lin = waist.linearise(block, data, states, point.z, point.levels, expected=False)
         ahead = jax.jvp(jax.grad(total), (point.z,), (jnp.ones_like(point.z),))
         found.append((lin, total(point.z), ahead))
     return found

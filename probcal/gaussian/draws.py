@@ -88,12 +88,8 @@ def simulated(at: Expansion, pulls: Sequence[Any], key: jax.Array) -> list[tuple
 
     `pulls` (E, n, D) are added to the scores of the states.
     """
-    given, seed = [(own.L, own.half) for own in at.given_biases()], np.asarray(jax.random.key_data(key))
-    noises = tuple(  # of each kind its own, so that those of further epochs change no other
-        np.stack([np.random.default_rng((*seed, r, kind)).standard_normal(pull.shape) for kind in range(2)])
-        for r, pull in enumerate(pulls)
-    )
-    return _simulated(at.model, at.eliminated, given, tuple(pulls), noises)
+    given = [(own.L, own.half) for own in at.given_biases()]
+    return _simulated(at.model, at.eliminated, given, tuple(pulls), key)
 
 
 @jax.jit
@@ -102,10 +98,12 @@ def _simulated(
     solved: Eliminated,
     roots: Sequence[tuple[jax.Array, jax.Array]],
     pulls: Sequence[Any],
-    noises: Sequence[Any],
+    key: jax.Array,
 ) -> list[tuple[jax.Array, rec.Smoothed]]:
     found = []
-    for part, (L, half), kept, pull, noise in model.each_layout(roots, solved.parts, pulls, noises):
+    for r, (part, (L, half), kept, pull) in enumerate(model.each_layout(roots, solved.parts, pulls)):
+        shape, seed = pull.shape, jax.random.fold_in(key, r)
+        noise = jax.vmap(lambda own, shape=shape: jax.random.normal(own, shape))(jax.random.split(seed))
         prior = rec.trajectory(part.F, L, jnp.zeros((*part.drift.shape, 1)), noise[0])
         found.append((prior, rec.smooth(part.F, kept.gain, kept.J @ prior + half @ noise[1] + pull)))
     return found

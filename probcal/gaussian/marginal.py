@@ -74,7 +74,7 @@ def _adjoint(
     score = jax.grad(lambda x, z: log_likelihood(model, At(x, z, point.levels)), argnums=(0, 1))
 
     def observed(x: States) -> tuple[States, jax.Array]:
-        """What the observed information adds to the expected, times x, and K x."""
+        """The observed information less the expected, times x, and K x."""
         by_state, by_bias = jax.jvp(lambda at: score(at, point.z), (point.states,), (x,))[1]
         parts = model.each_layout(solved.parts, by_state, x)
         return tuple(-own - jnp.einsum("eij,ej->ei", kept.J, v) for _, kept, own, v in parts), by_bias

@@ -15,7 +15,7 @@ import numpy as np
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.room import check_room
-from probcal.gaussian.search import DAMPING, ROUNDING, between, blank, branch, damped_on, halved, quiet, repeated
+from probcal.gaussian.search import DAMPING, ROUNDING, between, branch, damped_on, halved, looped, quiet, zeros_from
 from probcal.gaussian.solves import Dense
 from probcal.linalg import library
 from probcal.model.model import At, Model, Recursion, Tail, Where
@@ -138,7 +138,7 @@ def log_density(model: Model, point: Point) -> jax.Array:
 
 
 def _tilt(model: Model, point: Where) -> Any:
-    """What the tilt of the model adds to the log density at a point."""
+    """The log density of integrated places at a point."""
     return np.zeros(()) if model.tilt is None else model.tilt.value(point.z)
 
 
@@ -434,7 +434,7 @@ def find_mode(
     value = cost(model, start, prior)
     zero, none, no = _nothing()
     mode = Mode(start, value, none, no, ~no, zero, zero)
-    return repeated(lambda s: ~s.over, body, _Search(mode, value, zero, no | (iterations <= 0))).mode
+    return looped(lambda s: ~s.over, body, _Search(mode, value, zero, no | (iterations <= 0))).mode
 
 
 def _nothing() -> Any:
@@ -482,10 +482,10 @@ def find_tracks(model: Model, start: Point, iterations: int, tolerance: float) -
         )  # fmt: skip
 
     xp = library(*jax.tree.leaves((model, start)))
-    parts, (zero, none, no) = None if xp is np else blank(at, start), _nothing()
+    parts, (zero, none, no) = None if xp is np else zeros_from(at, start), _nothing()
     begun = xp.asarray(part_way(model, start, start, np.zeros(sum(model.targets)))[0])
     first = _Tracking(start, begun, parts, ~no, zero + np.inf, xp.ones(begun.shape, bool), none)
-    return repeated(lambda s: s.moving.any() & (s.iteration < iterations), body, first).point
+    return looped(lambda s: s.moving.any() & (s.iteration < iterations), body, first).point
 
 
 @jax.jit

@@ -120,7 +120,7 @@ def climb_traced(objective: Objective, start: Any, biases: int, iterations: int,
         return search_step(objective, s, objective.expand(point), tolerance)
 
     return jax.lax.while_loop(
-        lambda s: ~s.done & (s.count <= iterations), body, Search.begin(blank(objective.expand, start), biases)
+        lambda s: ~s.done & (s.count <= iterations), body, Search.begin(zeros_from(objective.expand, start), biases)
     )
 
 
@@ -143,7 +143,7 @@ def branch(condition: Any, yes: Callable[..., Any], no: Callable[..., Any], *giv
     return jax.lax.cond(condition, yes, no, *given)
 
 
-def repeated(on: Callable[[Any], Any], step: Callable[[Any], Any], state: Any) -> Any:
+def looped(on: Callable[[Any], Any], step: Callable[[Any], Any], state: Any) -> Any:
     """The state after steps while it is to go on, by a `while_loop` where it is traced.
 
     The host calls kernels that other parts of a fit use too.
@@ -200,7 +200,7 @@ def _directed(objective: Objective, tolerance: Any, s: Search) -> Search:
         step, damping, fresh = state
         return fresh | (~(xp.isfinite(step).all() & (s.slope @ step >= 0)) & (damping <= DAMPING))
 
-    step, damping, _ = repeated(lacking, more, (s.step, s.damping, xp.ones((), bool)))
+    step, damping, _ = looped(lacking, more, (s.step, s.damping, xp.ones((), bool)))
     promised = 0.5 * s.slope @ step
     converged = (promised <= tolerance) & (damping <= 1.0) & xp.isfinite(s.value)
     return s._replace(
@@ -224,7 +224,7 @@ def _direction(objective: Objective, s: Search, damping: Any) -> Any:
     return step + (inverse.T @ (own * share - changes @ step)) @ s.moves
 
 
-def blank(function: Callable[..., Any], *given: Any) -> Any:
+def zeros_from(function: Callable[..., Any], *given: Any) -> Any:
     """Zeros in the form of what a function gives, with which a traced loop begins."""
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, *given))
 
@@ -247,8 +247,8 @@ def halved(value: Callable[[Any], tuple[Any, Any]], bound: Any) -> tuple[Any, An
         return (state[2] == 0) | ((~(state[1] <= bound)).any() & (state[2] < HALVINGS))
 
     one = xp.ones_like(bound)
-    share, found, _, point = repeated(
-        worse, shorter, (one, bound, np.zeros((), int), None if xp is np else blank(value, one)[1])
+    share, found, _, point = looped(
+        worse, shorter, (one, bound, np.zeros((), int), None if xp is np else zeros_from(value, one)[1])
     )
     return share, found, point
 

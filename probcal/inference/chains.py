@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from probcal.devices import over_devices
 from probcal.gaussian.frame import place
-from probcal.gaussian.search import blank
+from probcal.gaussian.search import zeros_from
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, conditional, log_prior
 from probcal.inference.sides import Sided, shifted, side_of
@@ -50,7 +50,7 @@ def keep(form: Form, posed: Posed, sample: Sample) -> Draw:
 
 def repeated(step: Callable[[Any], tuple[Any, Sample]], state: Any, thin: jax.Array) -> tuple[Any, Sample]:
     """The state after `thin` steps, and the last draw."""
-    return jax.lax.fori_loop(0, thin, lambda _, at: step(at[0]), (state, blank(step, state)[1]))
+    return jax.lax.fori_loop(0, thin, lambda _, at: step(at[0]), (state, zeros_from(step, state)[1]))
 
 
 @partial(jax.jit, static_argnames=("method", "form"))

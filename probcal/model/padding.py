@@ -10,7 +10,7 @@ from probcal.model.model import Model, Recursion
 from probcal.model.rows import BY_ROW, Rows
 from probcal.model.trajectories import Trajectories
 
-LEAST, PARTS = 8, 8  # sizes are multiples of the first, and of the largest power of two below one part in the second
+PARTS = 8  # sizes are multiples of this, and of the largest power of two that is one part in so many at most
 
 
 def roomy(count: int) -> int:
@@ -19,16 +19,16 @@ def roomy(count: int) -> int:
     >>> [roomy(count) for count in (1, 20, 100, 1_000, 1_816)]
     [8, 24, 104, 1024, 1920]
     """
-    step = max(LEAST, (1 << count.bit_length()) // (2 * PARTS))
+    step = max(PARTS, (1 << count.bit_length()) // (2 * PARTS))
     return -(-count // step) * step
 
 
-def repeated(count: int) -> np.ndarray:
+def padded_index(count: int) -> np.ndarray:
     """Numbers of so many entries, the last one over again up to the size to which they are padded."""
     return np.minimum(np.arange(roomy(count)), count - 1)
 
 
-def padded(model: Model) -> Model:
+def padded_model(model: Model) -> Model:
     """The model with masked rows, and behind the last epoch of a recursion some at which its target stays as it is.
 
     Its arrays are of NumPy. What is computed from it of the rest stays as it was.
@@ -36,7 +36,7 @@ def padded(model: Model) -> Model:
 
     def longer(part: Recursion) -> Recursion:
         E, n = part.drift.shape
-        found: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[repeated(E)], part)
+        found: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[padded_index(E)], part)
         still = {"F": np.eye(n), "L": 0.0, "level": len(model.level_spread), "drift": 0.0, "dt": 0.0, "first": False}
         for name, value in still.items():
             getattr(found, name)[E:] = value
@@ -46,7 +46,7 @@ def padded(model: Model) -> Model:
 
     def masked(data: Rows) -> Rows:
         N = len(data.y)
-        found: Any = data._replace(**{name: np.asarray(getattr(data, name))[repeated(N)] for name in BY_ROW})
+        found: Any = data._replace(**{name: np.asarray(getattr(data, name))[padded_index(N)] for name in BY_ROW})
         found.mask[N:] = 0.0
         return found
 
@@ -58,8 +58,8 @@ def longer(path: Trajectories) -> Trajectories:
 
     def more(states: Any, noises: Any) -> tuple[np.ndarray, np.ndarray]:
         E = len(noises)
-        found = np.asarray(noises)[repeated(E)]
+        found = np.asarray(noises)[padded_index(E)]
         found[E:] = 0.0
-        return np.asarray(states)[repeated(E)], found
+        return np.asarray(states)[padded_index(E)], found
 
     return path.map(more)

@@ -15,7 +15,7 @@ import numpy as np
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.mode import factors
-from probcal.gaussian.search import blank
+from probcal.gaussian.search import zeros_from
 from probcal.tracking.sampler.sampled import Association, Fit, Recording, chances, fitted, log_clutter
 from probcal.tracking.scan import View, detected, present
 from probcal.tracking.update import TINY, Biases, rows_from, updated
@@ -323,7 +323,7 @@ def move(
         fit = fitted(scene, views, found.a)
         return (fit, jax.lax.cond(first, propose, lambda _: found, fit)), fit
 
-    none = blank(fitted, scene, views, rest)
+    none = zeros_from(fitted, scene, views, rest)
     start = (none, Proposal(rest, jnp.zeros(()), _nothing(none)))
     (there, found), both = jax.lax.scan(pass_, start, jnp.array([True, False]))
     fit = jax.tree.map(lambda leaf: leaf[0], both)

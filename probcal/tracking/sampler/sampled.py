@@ -16,7 +16,7 @@ from jax.scipy.special import gammaln
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.mode import Eliminated, Kept, Point, eliminate, factors, follow, log_density
-from probcal.gaussian.search import between, blank, halved
+from probcal.gaussian.search import between, halved, zeros_from
 from probcal.gaussian.solves import Dense
 from probcal.model.epochs import Move
 from probcal.model.model import Model
@@ -153,7 +153,7 @@ def fitted(scene: Recording, views: tuple[View, ...], a: Association) -> Fit:
         return found, solved, new, value - new, count + 1
 
     start = _begun(scene, L, used, a)
-    first = ((*start, scene.z), blank(system, *start, scene.z), cost(*start, scene.z), jnp.full((), jnp.inf), 0)
+    first = ((*start, scene.z), zeros_from(system, *start, scene.z), cost(*start, scene.z), jnp.full((), jnp.inf), 0)
     (x, u, z), solved, value, _, _ = jax.lax.while_loop(lambda s: (s[3] > SETTLED) & (s[4] < STEPS), step, first)
     biases = Dense.of(jnp.sum(solved.information, 0) + prior.matrix())
     (kept,) = solved.parts
