@@ -59,7 +59,7 @@ class _Refits(NamedTuple):
                 model = model.with_tilt(tilt_at(model, point))
         prior = fit.prior._replace(alpha=jax.device_put(alpha))
         point = point._replace(z=jax.device_put(np.where(alpha < PINNED, point.z, 0.0)))
-        expand = partial(fit.engine.at if self.quick else fit.engine.settled, model)
+        expand = partial(fit.engine.at, model)
         how = (1, 0.0) if self.quick else (STEPS, TOLERANCE)
         at, factors = climb_to_mode(expand, point, Factors.of(prior), *how, marginal=False).at, Factors.of(prior)
         roots = [standardised(lin.score, lin.weight) for lin in at.rows]
