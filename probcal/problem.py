@@ -306,6 +306,7 @@ class Problem:
         found = found.at_times(self.moved, self.timed)
         return found.padded() if self.roomy else found
 
+    @float64
     def padded(self) -> Problem:
         """The same problem with masked rows and with epochs of no target, so that kernels serve others of its length.
 

@@ -44,7 +44,7 @@ def derived_keys(key: jax.Array, numbers: Sequence[int] = (0, 1)) -> list[jax.Ar
     """Keys of a key and each number, made on the host, where they need no kernel."""
     seed, kind = np.asarray(jax.random.key_data(key)).tolist(), jax.random.key_impl(key)
     words = [np.random.SeedSequence((*seed, number)).generate_state(len(seed)) for number in numbers]
-    return [jax.random.wrap_key_data(own, impl=kind) for own in words]
+    return [jax.random.wrap_key_data(jax.device_put(own), impl=kind) for own in words]
 
 
 @dataclass(frozen=True, eq=False)

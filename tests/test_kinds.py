@@ -189,7 +189,7 @@ def test_a_product_has_hyper_parameters_of_its_own():
             "included", "local_scale", "global_scale", "slab_variance", "alpha_delay", "share_n0_position", "share_n1",
             "slab_precision_n1",
         }  # fmt: skip
-        assert set(found.begin(jax.random.key(0))) == set(phi)
+        assert set(found.begin(2)) == set(phi)
         alpha = np.asarray(found.alpha(phi, jnp.ones(problem.model.biases)))
         at = dict(zip(problem.labels, alpha, strict=True))
         assert at["n0.delay"] == at["n2.delay"] == pytest.approx(float(phi["alpha_delay"][0]))

@@ -179,7 +179,7 @@ def _expanded(
     follow = np.asarray(at.solve(factors, pull.T)).T
     unknown = [level.unknown for level in members.levels]
     known = np.append(fit.problem.model.level_spread, np.inf)[unknown] ** -2
-    slope = here[:K] - np.append(fit.point.levels, 0.0)[unknown] * known
+    slope = here[:K] - (np.append(fit.point.levels, 0.0)[unknown] + moved) * known
     alone = known - np.diag(curved)
     matrix = np.diag(known) - 0.5 * (curved + curved.T) - pull @ follow.T
     if not (np.isfinite(matrix).all() and np.isfinite(slope).all() and (alone > 0).all()):

@@ -167,7 +167,8 @@ def _weighted(problem: Problem, tracked: dict[str, xr.Dataset]) -> Problem:
 
     def saved(part: Recursion, epochs: Epochs) -> tuple[jax.Array, ...]:
         names = weights_of_tails(part)
-        return tuple(jnp.asarray(saved_by_epoch(epochs, tracked, name, "process noise")) for name in names)
+        own = [saved_by_epoch(epochs, tracked, name, "process noise") for name in names]
+        return tuple(jax.device_put(np.where(epochs.target == "", 1.0, weight)) for weight in own)
 
     return problem.with_mixing(problem.model.each(saved, problem.epochs))
 

@@ -145,7 +145,7 @@ class _Own:
         own, after, node = self.biases[moving], np.append(z, 0.0), np.full(len(z) + 1, -1)
         node[own] = np.arange(len(own))[:, None]
         node[-1] = -1
-        each = [node[np.asarray(read)].max(1) for read in model.read]  # the node of each row, -1 of none
+        each = [node[np.asarray(read)].max(1, initial=-1) for read in model.read]  # the node of each row, -1 of none
         information: np.ndarray = np.eye(own.shape[1])
         for _ in range(STEPS):
             information, pull = np.tile(np.eye(own.shape[1]), (len(own), 1, 1)), -after[own]

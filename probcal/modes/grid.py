@@ -241,6 +241,7 @@ def grid_start(problem: Problem, z: Any = None, iterations: int = 30) -> Point:
                 precision[:, start:stop] = 1.0 / (NEAR * problem.extent) ** 2
             elif name in ("velocity", "acceleration"):
                 precision[:, start:stop] = 0.0
+        precision[epochs.target == ""] = 0.0  # behind the last epoch a target stays
         tracks.append(states)
         precisions.append(precision)
     return track_mode(problem, project(problem, tracks, precisions)._replace(z=z), iterations)
