@@ -79,7 +79,9 @@ class Precision(NamedTuple):
 
     def log_determinant(self) -> jax.Array:
         """Log determinant, a flat bias counted as one."""
-        return jnp.sum(jnp.log(jnp.where(self.alpha > 0, self.alpha, 1.0))) + self.logdet
+        xp = library(self.alpha)
+        alpha = xp.asarray(self.alpha)
+        return xp.log(alpha + (alpha == 0)).sum() + self.logdet
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,6 +18,7 @@ from probcal.errors import InputError, nearest
 from probcal.files import write_whole
 from probcal.labels import NOBODY, coordinates, listed, unescaped
 from probcal.lazy import pd
+from probcal.linalg import library
 from probcal.model import rows
 from probcal.model.sampled import path
 from probcal.network import Network
@@ -31,13 +32,26 @@ Key = int | jax.Array
 
 
 def as_key(key: Key) -> jax.Array:
-    """A jax key from a seed or a key."""
+    """A jax key from a seed, as `jax.random.key` makes it but without a kernel, or a key."""
     if not isinstance(key, (int, np.integer)):
         return key
     try:
-        return jax.random.key(key)
+        low, high = np.array([key], "<i8").view("<u4")
     except OverflowError:
         raise InputError(f"key={key}: a seed is a whole number below 2**63") from None
+    return jax.random.wrap_key_data(jax.device_put(np.array([high, low])), impl="threefry2x32")
+
+
+def chance_of(key: jax.Array) -> np.random.Generator:
+    """NumPy's generator seeded by a key: draws on the host, which need no kernel."""
+    return np.random.default_rng(np.asarray(jax.random.key_data(key)))
+
+
+def standard_normals(key: jax.Array, shapes: Sequence[tuple[int, ...]]) -> list[Any]:
+    """Standard normal draws of some shapes, on the host but where the key is traced."""
+    if library(key) is not np:
+        return [jax.random.normal(jax.random.fold_in(key, r), shape) for r, shape in enumerate(shapes)]
+    return list(map(chance_of(key).standard_normal, shapes))
 
 
 def derived_keys(key: jax.Array, numbers: Sequence[int] = (0, 1)) -> list[jax.Array]:

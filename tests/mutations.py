@@ -114,7 +114,7 @@ MUTATIONS = [
     Mutation("return weight + posed.frame.log_likelihood(theta) - 0.5 * square + volume", "return weight - 0.5 * square + volume", "test_mirrors.py"),
     Mutation("change / (1.0 + change * row[m])", "change / (1.0 - change * row[m])", "test_relevance.py"),
     # inference/integrate.py, propagate.py
-    Mutation("solved.information @ z + score", "solved.information @ z - score", "test_integrate.py"),
+    Mutation("information @ z + score - 0.5", "information @ z - score - 0.5", "test_integrate.py"),
     Mutation("jnp.clip(1.0 - alpha * variance, 0.0, 1.0), 0.0)\n        return total", "jnp.clip(1.0 - variance, 0.0, 1.0), 0.0)\n        return total", "test_integrate.py"),
     Mutation("total / count + jnp.cov(", "total / count + 0 * jnp.cov(", "test_integrate.py"),
     Mutation("without_negative(precision - self.sites.precision, LEAST)", "without_negative(precision, LEAST)", "test_integrate.py"),
@@ -129,14 +129,14 @@ MUTATIONS = [
     Mutation("pull - (point.levels + step) / model.level_spread**2", "pull", "test_formulas.py"),
     Mutation("jax.tree.map(jnp.add, alone,", "jax.tree.map(lambda a, b: b, alone,", "test_formulas.py"),
     Mutation("@ moved[epoch] + by_bias", "@ moved[epoch] - by_bias", "test_formulas.py test_observability.py"),
-    Mutation("jnp.exp(point.levels - levels)", "jnp.exp(levels - point.levels)", "test_formulas.py"),
+    Mutation("xp.exp(point.levels - levels)", "xp.exp(levels - point.levels)", "test_formulas.py"),
     Mutation("*map(np.square, point.noises)", "", "test_guards.py"),
     # gaussian/jointly.py
     Mutation("slopes.z - model.onto_biases(", "slopes.z + model.onto_biases(", "test_engine.py"),
     # gaussian/draws.py
-    Mutation("x[:, :, None] + prior - smooth.states", "x[:, :, None] + prior + smooth.states", "test_exact.py"),
+    Mutation("prior - smooth.states", "prior + smooth.states", "test_exact.py"),
     Mutation("jax.random.normal(key, (count, M)) @ root.T", "jax.random.normal(key, (count, M)) @ root", "test_exact.py"),
-    Mutation("kept.J @ prior + half @ noise[1]", "kept.J @ prior", "test_exact.py"),
+    Mutation("kept.J @ prior + half @ scores", "kept.J @ prior", "test_exact.py"),
     # identifiability/gauge.py
     Mutation("moved.append(-x)", "moved.append(0 * x)", "test_observability.py"),
     # gaussian/frame.py
@@ -201,7 +201,7 @@ MUTATIONS = [
     # priors.py
     Mutation("+ 2 * self.rate + 1e-300", "+ self.rate + 1e-300", "test_methods.py"),
     Mutation("total(z**2 + variance)", "total(z**2)", "test_methods.py"),
-    Mutation("jnp.where(self.alpha > 0, self.alpha, 1.0))) + self.logdet", "jnp.where(self.alpha > 0, self.alpha, 1.0)))", "test_methods.py"),
+    Mutation("xp.log(alpha + (alpha == 0)).sum() + self.logdet", "xp.log(alpha + (alpha == 0)).sum()", "test_methods.py"),
     # inference/
     Mutation("alpha=jnp.where(fresh, state.alpha, alpha)", "alpha=alpha", "test_methods.py test_exact.py"),
     Mutation("- cost(model, point, held) - jnp.sum(penalty)", "- cost(model, point, held)", "test_methods.py"),

@@ -55,6 +55,11 @@ def world(place=0.5, rate=0.2, motion=0.4, *, table=None, drift=None, key=0):
     return Problem(network, targets, table), table
 
 
+def learnt(fit):
+    levels = fit.problem.levels
+    return {own.label: own.guess * float(np.exp(log)) for own, log in zip(levels, fit.point.levels, strict=True)}
+
+
 def evidence(**stds):
     problem, _ = world(table=world()[1], **stds)
     return float(probcal.fit(problem, MAP(trajectory="joint")).attrs["log_evidence"])
@@ -64,7 +69,7 @@ def evidence(**stds):
 def test_slope_and_curvature_are_those_of_the_evidence():
     problem, _ = world()
     fit = take_up(problem, probcal.fit(problem, MAP(trajectory="joint")))
-    members = members_of(problem)
+    problem, members = fit.problem, members_of(fit.problem)
     assert [level.label for level in members.levels] == ["fixer.place_std", "fixer.rate_std", "motion.velocity_std"]
     assert [(index == 0).sum() for index in members.rows] == [2 * problem.measurements.measured[:, 0].sum()]
     found = members.sums(*score(fit.expansion, fit.factors))
@@ -122,6 +127,21 @@ def test_levels_in_the_table_and_unknown_ones_have_their_place():
     assert check["level"].values.tolist()[2:] == ["motion.velocity_std", "motion.velocity_std#2"]
     assert abs(np.log(check["factor"].sel(level="fixer.place_std").item())) < 0.02  # it was learnt
     assert "level" not in tree["finding"]["kind"].values
+
+
+@pytest.mark.slow
+def test_what_is_asked_of_all_levels_is_where_a_fit_of_all_ends():
+    """One level is unknown with a prior that two wrong ones pull it from; then all three are."""
+    _, table = world()
+    told = world(place=Unknown(0.5, 1.05), rate=0.1, motion=0.02, table=table)[0]
+    fit = take_up(told, probcal.fit(told, MAP()))
+    members = members_of(fit.problem)
+    asked = ask(fit, members, fit.factors)
+    found = {level.label: level.declared for level in members.levels} | learnt(fit)
+    free = world(place=Unknown(0.5, 1.05), rate=Unknown(0.1), motion=Unknown(0.02), table=table)[0]
+    wanted = learnt(take_up(free, probcal.fit(free, MAP())))
+    ends = {name: found[name] * factor for name, factor in zip(found, np.exp(asked.step), strict=True)}
+    assert ends == pytest.approx(wanted, rel=0.03)
 
 
 @pytest.mark.slow

@@ -26,6 +26,7 @@ from probcal import (
     Network,
     Node,
     Problem,
+    Static,
     assess,
     fit,
     kernels,
@@ -33,7 +34,9 @@ from probcal import (
     sensors,
 )
 from probcal.geometry import norm
+from probcal.modes.grid import grid_start
 from probcal.priors import Gaussian
+from probcal.types import float64
 
 OTHERS = (EA(), EA(precisions="maximised"), EA(engine="superlu"), LeastSquares(), EM(Cubature()), EMEA(iterations=12))
 
@@ -134,6 +137,15 @@ def test_a_padded_problem_has_the_answer_of_the_plain_one(method, monkeypatch):
     assert padded["calibration"].to_dataset().sizes == plain["calibration"].to_dataset().sizes
     for group in ("calibration", *(f"track/{name}" for name in plain["track"].children)):
         xr.testing.assert_allclose(padded[group].to_dataset(), plain[group].to_dataset(), rtol=1e-4, atol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("motion", [worlds.two_motions, lambda start: Static()], ids=["two motions", "static"])
+def test_a_start_from_the_grid_is_not_moved_by_padding(motion):
+    problem = worlds.small(motion=motion, scans=9)
+    starts = [float64(grid_start)(own, None, 0) for own in (problem.padded(), problem)]
+    for long, short in zip(*(start.states for start in starts), strict=True):
+        np.testing.assert_allclose(np.asarray(long)[: len(short)], short, rtol=1e-6, atol=1e-6)
 
 
 def test_a_recording_of_about_the_same_length_compiles_nothing(kept_kernels):

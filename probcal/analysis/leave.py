@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from scipy import special
@@ -24,7 +23,6 @@ from probcal.gaussian.places import tilt_at
 from probcal.inference.fitted import Judged
 from probcal.inference.pose import TAILED
 from probcal.inference.psis import smoothed
-from probcal.model.rows import standardised
 from probcal.results.read import summed_log_likelihood
 
 STEPS = 20  # Gauss-Newton steps of a refit
@@ -61,9 +59,11 @@ class _Refits(NamedTuple):
         point = point._replace(z=jax.device_put(np.where(alpha < PINNED, point.z, 0.0)))
         expand = partial(fit.engine.at, model)
         how = (1, 0.0) if self.quick else (STEPS, TOLERANCE)
-        at, factors = climb_to_mode(expand, point, Factors.of(prior), *how, marginal=False).at, Factors.of(prior)
-        roots = [standardised(lin.score, lin.weight) for lin in at.rows]
-        square = sum(float(jnp.sum(own**2)) for own in (*roots, *at.point.noises)) + float(prior.square(at.point.z))
+        factors = Factors.of(prior)
+        at = climb_to_mode(expand, point, factors, *how, marginal=False).at
+        roots = [lin.score / np.sqrt(np.maximum(lin.weight, 1e-300)) for lin in jax.tree.map(np.asarray, at.rows)]
+        noises = sum(float(np.square(own).sum()) for own in (*roots, *at.point.noises))
+        square = noises + float(prior.square(at.point.z))
         return evidence(at, prior, factors).value, square
 
 

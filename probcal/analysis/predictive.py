@@ -80,11 +80,10 @@ def _discrepancies(
 def check_replicas(fit: Judged, drawn: FitDraws, key: jax.Array) -> Predictive:
     """P-values by sensor and channel, and kurtosis, at draws of a fit."""
     problem = fit.problem
-    gaussian = all_gaussian(problem.model)
     sensors = tuple(jax.device_put(problem.measurements.sensor[index]) for index in problem.row_index)
     count = len(problem.network.sensors)
     found, fourth = _discrepancies(problem.model, fit.point.levels, drawn, sensors, count, key)
-    kurtosis = np.zeros(len(fit.data)) if gaussian else exact_kurtosis(fit, fit.flat(fourth) - 3.0)
+    kurtosis = np.zeros(len(fit.data)) if all_gaussian(problem.model) else exact_kurtosis(fit, fit.flat(fourth) - 3.0)
     parts = list[np.ndarray]()
     for sensor, values in zip(sensors, map(np.asarray, found), strict=True):
         above = (values[:, 1] > values[:, 0]).mean(0) + 0.5 * (values[:, 1] == values[:, 0]).mean(0)  # (S, 2, C)

@@ -31,7 +31,7 @@ def check_process(case: Case) -> Checked:
     if count < FEWEST:
         return Checked()
     still = [np.zeros((*part.drift.shape, count)) for part in problem.model.recursions]
-    drawn = [smooth.noises for _, smooth in simulated(case.fit.expansion, still, case.keys[2])]
+    drawn = [noises for _, noises in simulated(case.fit.expansion, still, case.keys[2])]
     for name, _, part, smoothed, columns in problem.tracks(problem.model.recursions, case.fit.point.noises, drawn):
         mine, active = ~part.first, part.L.any(1)
         for component, own in problem.noise_columns(name):

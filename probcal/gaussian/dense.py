@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian.draws import draw_trajectories
-from probcal.gaussian.engine import Estimate, Factors, Sampled, Spread, density_of
+from probcal.gaussian.engine import Engine, Estimate, Factors, Sampled, Spread, density_of
 from probcal.gaussian.linearised import (
     Trajectory,
     compress_and_eliminate,
@@ -23,7 +23,7 @@ from probcal.gaussian.linearised import (
     trajectories_of,
 )
 from probcal.gaussian.marginal import volume_slope
-from probcal.gaussian.mode import SETTLED, TRACK_STEPS, Compressed, Eliminated, Point, find_tracks, follow
+from probcal.gaussian.mode import Compressed, Eliminated, Point, follow
 from probcal.gaussian.solves import Dense
 from probcal.linalg import without_negative
 from probcal.model.model import Data, Model
@@ -32,7 +32,7 @@ from probcal.simulate import derived_keys
 
 
 @dataclass(frozen=True)
-class DenseEngine:
+class DenseEngine(Engine):
     """Matrices of all biases: the fastest where they fit."""
 
     cheap: ClassVar[bool] = True
@@ -42,10 +42,6 @@ class DenseEngine:
         """The posterior at a consistent point; rows as the caller linearised them."""
         rows = linearise_rows(model, point) if rows is None else tuple(rows)
         return DenseExpansion(model, point, rows, *compress_and_eliminate(model, point, rows))
-
-    def settled(self, model: Model, point: Point) -> DenseExpansion:
-        """The same at the modes of its trajectories for its biases."""
-        return self.at(model, find_tracks(model, point, TRACK_STEPS, SETTLED))
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,8 +156,7 @@ class DenseExpansion:
 
     def predicted(self, factors: Factors) -> Data:
         """Variance (N, C) of each predicted value."""
-        covariance = self.covariance(factors)
-        return predicted_variances(self.model, self.rows, self.trajectories, covariance)
+        return predicted_variances(self.model, self.rows, self.trajectories, self.covariance(factors))
 
     def leverages(self, factors: Factors) -> Data:
         """Leverage of every datum (N, C) on the biases: w times the part of its variance that the

@@ -14,7 +14,7 @@ from probcal.gaussian.engine import Expansion
 from probcal.gaussian.mode import Eliminated, Point
 from probcal.model.model import At, Data, Model
 from probcal.model.rows import Linearised
-from probcal.simulate import derived_keys
+from probcal.simulate import derived_keys, standard_normals
 
 PASS = 200  # draws that are made at once
 VALUES = 4_000_000  # of all states that are drawn at once, at most
@@ -80,16 +80,20 @@ def draw_trajectories(at: Expansion, z: jax.Array, key: jax.Array) -> tuple[jax.
 
     Draws from the motion, less their smoothed selves, all as columns of one pass (Durbin and Koopman 2002).
     """
-    return _around(at.model, at.point, simulated(at, _pulled(at.model, at.point, at.rows, z), key))
+    drawn = simulated(at, _pulled(at.model, at.point, at.rows, z), key)
+    xp = linalg.library(*jax.tree.leaves(drawn))
+    pairs = at.model.each_layout(at.point.states, drawn)
+    return tuple(xp.moveaxis(xp.asarray(x)[:, :, None] + xp.asarray(apart), 2, 0) for _, x, (apart, _) in pairs)
 
 
-def simulated(at: Expansion, pulls: Sequence[Any], key: jax.Array) -> list[tuple[jax.Array, rec.Smoothed]]:
-    """Trajectories (E, n, D) drawn from the motion, less its drift, and the smoothed ones of their data.
+def simulated(at: Expansion, pulls: Sequence[Any], key: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
+    """Trajectories (E, n, D) drawn from the motion less the smoothed ones of their data, and the noises of these.
 
     `pulls` (E, n, D) are added to the scores of the states.
     """
     given = [(own.L, own.half) for own in at.given_biases()]
-    return _simulated(at.model, at.eliminated, given, tuple(pulls), key)
+    noises = standard_normals(key, [(2, *pull.shape) for pull in pulls])
+    return _simulated(at.model, at.eliminated, given, tuple(pulls), noises)
 
 
 @jax.jit
@@ -98,14 +102,13 @@ def _simulated(
     solved: Eliminated,
     roots: Sequence[tuple[jax.Array, jax.Array]],
     pulls: Sequence[Any],
-    key: jax.Array,
-) -> list[tuple[jax.Array, rec.Smoothed]]:
+    noises: Sequence[Any],
+) -> list[tuple[jax.Array, jax.Array]]:
     found = []
-    for r, (part, (L, half), kept, pull) in enumerate(model.each_layout(roots, solved.parts, pulls)):
-        shape, seed = pull.shape, jax.random.fold_in(key, r)
-        noise = jax.vmap(lambda own, shape=shape: jax.random.normal(own, shape))(jax.random.split(seed))
-        prior = rec.trajectory(part.F, L, jnp.zeros((*part.drift.shape, 1)), noise[0])
-        found.append((prior, rec.smooth(part.F, kept.gain, kept.J @ prior + half @ noise[1] + pull)))
+    for part, (L, half), kept, pull, (moves, scores) in model.each_layout(roots, solved.parts, pulls, noises):
+        prior = rec.trajectory(part.F, L, jnp.zeros((*part.drift.shape, 1)), moves)
+        smooth = rec.smooth(part.F, kept.gain, kept.J @ prior + half @ scores + pull)
+        found.append((prior - smooth.states, smooth.noises))
     return found
 
 
@@ -115,13 +118,6 @@ def _pulled(model: Model, point: Point, rows: Sequence[Linearised], z: jax.Array
     along = model.by_bias(rows, (z - point.z[None, :]).T)
     weighted = tuple(lin.weight[:, :, None] * own for *_, lin, own in model.each_block(rows, along))
     return tuple(model.onto_states(rows, weighted))
-
-
-@jax.jit
-def _around(model: Model, point: Point, both: list[tuple[jax.Array, rec.Smoothed]]) -> tuple[jax.Array, ...]:
-    pairs = model.each_layout(point.states, both)
-    drawn = [x[:, :, None] + prior - smooth.states for _, x, (prior, smooth) in pairs]
-    return tuple(jnp.moveaxis(x, 2, 0) for x in drawn)
 
 
 @partial(jax.jit, static_argnames="keep")

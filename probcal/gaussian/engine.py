@@ -16,7 +16,16 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import jax
 import numpy as np
 
-from probcal.gaussian.mode import Eliminated, Point, level_square, log_density, mixing_gain
+from probcal.gaussian.mode import (
+    SETTLED,
+    TRACK_STEPS,
+    Eliminated,
+    Point,
+    find_tracks,
+    level_square,
+    log_density,
+    mixing_gain,
+)
 from probcal.model.model import Data, Model
 from probcal.model.rows import Linearised
 from probcal.priors import Precision
@@ -215,6 +224,7 @@ class Engine(Protocol):
 
     def settled(self, model: Model, point: Point) -> Expansion:
         """The same at the modes of its trajectories for its biases."""
+        return self.at(model, find_tracks(model, point, TRACK_STEPS, SETTLED))
 
 
 def told_alone(at: Expansion) -> np.ndarray:

@@ -135,9 +135,10 @@ def _parameters(model: Model, point: Point, spread: Data, before: jax.Array) -> 
     return jax.lax.fori_loop(0, STEPS, step, start)
 
 
-@jax.jit
 def at_levels(model: Model, point: Point, levels: jax.Array) -> Point:
     """The same trajectories and biases at other noise levels: the whitened noises are rescaled."""
-    ratio = jnp.concatenate([jnp.exp(point.levels - levels), jnp.ones(1)])
-    noises = model.each(lambda part, u: u * ratio[part.level], point.noises)
+    xp = linalg.library(*jax.tree.leaves((model, point, levels)))
+    point, levels = jax.tree.map(xp.asarray, (point, levels))
+    ratio = xp.append(xp.exp(point.levels - levels), 1.0)
+    noises = model.each(lambda part, u: u * ratio[xp.asarray(part.level)], point.noises)
     return point._replace(levels=levels, noises=noises)

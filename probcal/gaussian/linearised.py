@@ -67,10 +67,11 @@ def state_variances(trajectories: Sequence[Trajectory], covariance: jax.Array) -
     )
 
 
-@jax.jit
 def noise_variances(trajectories: Sequence[Trajectory], covariance: jax.Array) -> tuple[jax.Array, ...]:
     """Variance (E, n) of every whitened noise of each recursion, for a covariance (M, M) of z."""
-    return tuple(own.spread + jnp.einsum("eni,ij,enj->en", own.driven, covariance, own.driven) for own in trajectories)
+    xp = linalg.library(covariance, *jax.tree.leaves(trajectories))
+    known, covariance = jax.tree.map(xp.asarray, (tuple(trajectories), covariance))
+    return tuple(own.spread + (own.driven @ covariance * own.driven).sum(2) for own in known)
 
 
 @jax.jit

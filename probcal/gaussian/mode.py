@@ -371,7 +371,7 @@ def shortened(
 
     def at(share: jax.Array) -> tuple[jax.Array, Point]:
         costs, found = part_way(model, point, proposal, share * np.ones(sum(model.targets)))
-        return _known(model, found, prior) - _tilt(model, found) + library(share).sum(costs), found
+        return _known(model, found, prior) - _tilt(model, found) + library(costs).asarray(costs).sum(), found
 
     share, value, found = halved(at, bound)
     return found, value, share

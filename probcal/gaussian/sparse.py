@@ -12,22 +12,23 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian import recursion as rec
-from probcal.gaussian.engine import Estimate, Factors, Sampled, Spread, density_of
+from probcal.gaussian.engine import Engine, Estimate, Factors, Sampled, Spread, density_of
 from probcal.gaussian.factor import COLUMNS, Factor, Library
 from probcal.gaussian.held import hold, inform
 from probcal.gaussian.joint import JointPrecision
 from probcal.gaussian.jointly import times_weights
 from probcal.gaussian.linearised import GivenBiases, given_biases, linearise_rows
 from probcal.gaussian.marginal import volume_slope
-from probcal.gaussian.mode import SETTLED, TRACK_STEPS, Eliminated, Point, factors, find_tracks, inverse_factors
+from probcal.gaussian.mode import Eliminated, Point, factors, inverse_factors
 from probcal.model.model import Model
 from probcal.model.rows import Linearised
+from probcal.simulate import chance_of
 
 WHOLE = 600  # biases up to which a matrix of all is made on request (its eigenvalues take 0.2 s)
 
 
 @dataclass(frozen=True)
-class SparseEngine:
+class SparseEngine(Engine):
     """Nothing of size (M, M) or (E, n, M): what an epoch sees of the biases is few entries of a
     sparse matrix."""
 
@@ -51,10 +52,6 @@ class SparseEngine:
         joint = self._patterns[0][1]
         rows = linearise_rows(model, point) if rows is None else tuple(rows)
         return SparseExpansion(model, point, rows, joint, self.library)
-
-    def settled(self, model: Model, point: Point) -> SparseExpansion:
-        """The same at the modes of its trajectories for its biases."""
-        return self.at(model, find_tracks(model, point, TRACK_STEPS, SETTLED))
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +225,7 @@ class SparseExpansion:
 
     def deviations(self, factors: Factors, key: jax.Array, count: int) -> Sampled:
         """Biases and states drawn around zero, as they differ from their mean."""
-        found, rng = self.solved(factors), np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        found, rng = self.solved(factors), chance_of(key)
         drawn = found.factor.draw(rng, count)
         padded = np.concatenate([drawn, np.zeros((count, 1))], 1)  # no variable: -1
         states = tuple(jax.device_put(padded[:, own]) for own in self.joint.slots)

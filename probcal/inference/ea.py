@@ -25,6 +25,7 @@ from probcal.inference.posed import Form
 from probcal.inference.pruned import without_far_modes
 from probcal.inference.relevance import best_precisions
 from probcal.inference.run import KernelClimb, Maximiser, course_of, first_precision, learn, renew_noise, valued
+from probcal.linalg import library
 from probcal.model.model import Mixing, Model
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
 from probcal.problem import Problem
@@ -40,16 +41,17 @@ PRECISIONS = ("integrated", "maximised")
 
 
 @partial(jax.jit, static_argnames=("prior", "rule"))
-def _with_precisions(prior: Prior, given: Given, state: State, rule: str) -> tuple[State, jax.Array]:
-    """The state with precisions that follow from the last iteration, and whether there was none."""
-    fresh, found = jnp.isneginf(state.objective), state.found
+def _with_precisions(prior: Prior, given: Given, state: State, fresh: jax.Array, rule: str) -> State:
+    """The state with precisions that follow from the last iteration, if it is not a fresh one."""
+    found = state.found
     alpha = learn(prior, given, state.alpha, found.gamma, jnp.diagonal(found.covariance), state.point.z, rule)
-    return state._replace(alpha=jnp.where(fresh, state.alpha, alpha)), fresh
+    return state._replace(alpha=jnp.where(fresh, state.alpha, alpha))
 
 
 def learnt(model: Model, prior: Prior, given: Given, state: State, rule: str) -> tuple[Model, State]:
     """Model and state with precisions and levels that follow from what the last iteration found, if there was one."""
-    state, fresh = _with_precisions(prior, given, state, rule)
+    fresh = library(state.objective).isneginf(state.objective)
+    state = _with_precisions(prior, given, state, fresh, rule) if prior.learns else state
     return renew_noise(model, state, state.found.covariance, fresh)
 
 
@@ -75,13 +77,14 @@ def _iterate(model: Model, prior: Prior, given: Given, state: State, rule: str, 
     steps = FEW if few else STEPS if prior.proper else UNHELD
     known = state.carry or None
     mode, solved = _climb(model, state.point, now, steps, 1e-2 * given.tolerance, trajectory, known)
-    found = laplace_of(model, mode.point, solved, now)
-    return _settled(model, prior, given, state._replace(carry=() if known is None else solved, found=found), mode)
+    return _settled(model, prior, given, state, mode, solved)._replace(carry=() if known is None else solved)
 
 
 @partial(jax.jit, static_argnames="prior")
-def _settled(model: Model, prior: Prior, given: Given, state: State, mode: Mode) -> State:
+def _settled(model: Model, prior: Prior, given: Given, state: State, mode: Mode, solved: Eliminated) -> State:
     """The state at a mode, with what was found there."""
+    now = given.prior._replace(alpha=state.alpha)
+    state = state._replace(found=laplace_of(model, mode.point, solved, now))
     objective = (
         state.found.evidence
         if prior.proper or not prior.learns

@@ -20,7 +20,7 @@ from probcal.gaussian.engine import Engine, Expansion, Factors
 from probcal.gaussian.joint import blocks_of
 from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
 from probcal.gaussian.marginal import volume_slope
-from probcal.gaussian.mode import Eliminated, Point, smooth_tracks
+from probcal.gaussian.mode import Point, smooth_tracks
 from probcal.gaussian.search import chosen
 from probcal.inference.gibbs import gibbs_sweep
 from probcal.inference.hierarchy import Phi
@@ -32,6 +32,7 @@ from probcal.priors import Precision
 from probcal.results.answer import few_draws
 from probcal.results.blocks import SensorBlocks
 from probcal.results.schema import INTERVAL
+from probcal.simulate import chance_of
 
 CHAINS, BURN, FIRST, KEPT = (
     4,
@@ -168,7 +169,7 @@ def joint_draws(work: Propagation) -> tuple[np.ndarray, SensorBlocks]:
     swept, factors, here = work.swept, work.factors, work.likelihood.here
     M, whole = work.form.biases, work.likelihood.whole
     shape = (CHAINS, KEPT if whole else few_draws(M))
-    count, rng = shape[0] * shape[1], np.random.default_rng(np.asarray(jax.random.key_data(work.key)))
+    count, rng = shape[0] * shape[1], chance_of(work.key)
     ordered = np.asarray(here.deviations(factors, work.key, count).z)
     pick = rng.integers(len(swept.means), size=(count, M))
     centre, spread = (np.take_along_axis(np.asarray(part), pick, 0) for part in (swept.means, swept.sds))
@@ -186,17 +187,11 @@ def likelihood(how: Integration, model: Model, first: Precision, point: Point) -
     volume, smooth = (
         volume_slope(model, point, solved) if how.marginal else (jnp.zeros_like(point.z), jnp.ones((), bool))
     )
-    return _natural(point.z, first, solved, volume, smooth)
-
-
-@jax.jit
-def _natural(
-    z: jax.Array, first: Precision, solved: Eliminated, volume: jax.Array, smooth: jax.Array
-) -> tuple[Natural, jax.Array]:
-    score = solved.score - 0.5 * volume
-    pull = solved.information @ z + score
-    sound = smooth & jnp.all(jnp.isfinite(solved.information)) & jnp.all(jnp.isfinite(pull))
-    return Natural(solved.information, pull, jnp.zeros(0), first), sound
+    xp = linalg.library(point.z, solved.score)
+    information, score, z, volume, smooth = map(xp.asarray, (*solved[:2], point.z, volume, smooth))
+    pull = information @ z + score - 0.5 * volume
+    sound = smooth & xp.isfinite(information).all() & xp.isfinite(pull).all()
+    return Natural(information, pull, xp.zeros(0), first), sound
 
 
 def point_at(model: Model, point: Point, z: jax.Array) -> Point:

@@ -80,14 +80,13 @@ def expected_squares(fit: Judged, kept: np.ndarray) -> np.ndarray:
     return found
 
 
-@jax.jit
 def prepare(solved: Eliminated) -> list[Filter]:
     """Covariance pass of every recursion: with U the data's responses to the whitened prediction, S = I + U U'."""
     found = []
     for kept in solved.parts:
-        gain = kept.gain
+        gain = jax.tree.map(np.asarray, kept.gain)
         vectors, values, _ = linalg.singular(gain.predicted.mT @ gain.data)
-        size = jnp.sqrt(1.0 + values**2)
+        size = np.sqrt(1.0 + values**2)
         half = gain.predicted @ vectors
         found.append(Filter(gain, (half * (-1.0 / (size * (1.0 + size)))[:, None, :]) @ half.mT))
     return found

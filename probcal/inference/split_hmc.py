@@ -21,6 +21,7 @@ from probcal.gaussian.jointly import Variables, covariance_times, times_weights
 from probcal.gaussian.mode import Point, mixed_density, noises_of
 from probcal.model.model import At, Model, Recursion
 from probcal.model.rows import Linearised
+from probcal.simulate import chance_of
 
 SHORTER = 0.1  # share by which a turn may be shorter than a quarter
 
@@ -105,7 +106,7 @@ class SplitGaussian:
 
         A turn keeps the energy of the Gaussian; a kick p of slope g adds v'g + p'g / 2 to it at speed v.
         """
-        rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        rng = chance_of(key)
         speed = self.deviation(jax.random.fold_in(key, 0))
         begun, angle = speed, 0.5 * np.pi * (1.0 - SHORTER * rng.random()) / kicks
         step, gained = at - self.mean, 0.0

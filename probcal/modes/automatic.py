@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian.mode import Point, cost, find_mode
@@ -116,7 +115,7 @@ def polished(problem: Problem, start: Point, iterations: int = 30) -> Optimum:
 
 def sparse_cost(model: Model, point: Point) -> float:
     """Joint cost of a point with a Cauchy prior of scale one for each bias, infinite where there is none."""
-    flat = Precision(jnp.zeros(model.biases))
+    flat = Precision(jax.device_put(np.zeros(model.biases)))
     found = float(cost(model, point, flat) + np.log1p(np.asarray(point.z) ** 2).sum())
     return found if np.isfinite(found) else np.inf
 

@@ -185,8 +185,23 @@ class Static(Component):
         return np.zeros((len(dt), dimension, 0))
 
 
+class _Named(Component):
+    """One state component, a number unless it is `per_axis`."""
+
+    name: str
+    per_axis: bool = False
+
+    def names(self) -> tuple[tuple[str, bool], ...]:
+        """State component and whether it has one value an axis."""
+        return ((self.name, self.per_axis),)
+
+    def _each(self, entry: Any, dimension: int, dt: Any) -> Any:
+        """Matrices (E, s, s) of one entry."""
+        return blocks([[entry]], dimension if self.per_axis else 1, dt)
+
+
 @dataclass(frozen=True)
-class RandomWalk(Component):
+class RandomWalk(_Named):
     """A scalar (or, `per_axis`, a vector) component that drifts: `std` in unit s^-1/2, `initial` = (mean, std)."""
 
     name: str
@@ -201,17 +216,13 @@ class RandomWalk(Component):
         check_pair(self.initial, f'RandomWalk("{self.name}"): initial')
         check_driving(self.noise, f'RandomWalk("{self.name}"): noise')
 
-    def names(self) -> tuple[tuple[str, bool], ...]:
-        """State component and whether it has one value an axis."""
-        return ((self.name, self.per_axis),)
-
     def transition(self, dt: Any, dimension: int) -> Any:
         """Identity, shape (E, s, s)."""
-        return blocks([[1.0]], dimension if self.per_axis else 1, dt)
+        return self._each(1.0, dimension, dt)
 
     def noise_factor(self, dt: Any, dimension: int) -> Any:
         """Noise factors for unit std, shape (E, s, s)."""
-        return blocks([[dt.__array_namespace__().sqrt(dt)]], dimension if self.per_axis else 1, dt)
+        return self._each(dt.__array_namespace__().sqrt(dt), dimension, dt)
 
     def start(self) -> dict[str, tuple[Any, float]]:
         """Mean and standard deviation at the first epoch."""
@@ -219,7 +230,7 @@ class RandomWalk(Component):
 
 
 @dataclass(frozen=True)
-class Remembered(Component):
+class Remembered(_Named):
     """The remembered noise of one channel of one sensor (`noise.Memory`), a state that the rows of this sensor read.
 
     `level` is the label of its std.
@@ -233,18 +244,14 @@ class Remembered(Component):
     time: float
     level: str
 
-    def names(self) -> tuple[tuple[str, bool], ...]:
-        """State component, a number."""
-        return ((self.name, False),)
-
     def transition(self, dt: Any, dimension: int) -> Any:
         """The fraction that is remembered, shape (E, 1, 1)."""
-        return blocks([[dt.__array_namespace__().exp(-dt / self.time)]], 1, dt)
+        return self._each(dt.__array_namespace__().exp(-dt / self.time), dimension, dt)
 
     def noise_factor(self, dt: Any, dimension: int) -> Any:
         """Noise factors for unit std, shape (E, 1, 1)."""
         xp = dt.__array_namespace__()
-        return blocks([[xp.sqrt(-xp.expm1(-2.0 * dt / self.time))]], 1, dt)
+        return self._each(xp.sqrt(-xp.expm1(-2.0 * dt / self.time)), dimension, dt)
 
     def start(self) -> dict[str, tuple[Any, float]]:
         """Mean and standard deviation at the first epoch, which are those of every epoch."""
@@ -252,7 +259,7 @@ class Remembered(Component):
 
 
 @dataclass(frozen=True)
-class White(Component):
+class White(_Named):
     """A component drawn anew at every epoch (an unknown emission range, say): `mean` (one or one an axis), `std`."""
 
     memoryless: ClassVar[bool] = True
@@ -269,17 +276,13 @@ class White(Component):
         check_level(self.std, f'White("{self.name}"): std')
         check_driving(self.noise, f'White("{self.name}"): noise')
 
-    def names(self) -> tuple[tuple[str, bool], ...]:
-        """State component and whether it has one value an axis."""
-        return ((self.name, self.per_axis),)
-
     def transition(self, dt: Any, dimension: int) -> Any:
         """Zero, shape (E, s, s): nothing is kept."""
-        return blocks([[0.0]], dimension if self.per_axis else 1, dt)
+        return self._each(0.0, dimension, dt)
 
     def noise_factor(self, dt: Any, dimension: int) -> Any:
         """Identity, shape (E, s, s)."""
-        return blocks([[1.0]], dimension if self.per_axis else 1, dt)
+        return self._each(1.0, dimension, dt)
 
     def means(self, time: np.ndarray, dimension: int) -> np.ndarray:
         """The one mean at every epoch, shape (E, s)."""

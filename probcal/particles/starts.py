@@ -14,6 +14,7 @@ from probcal.modes.explore import Mirrored
 from probcal.priors import Gaussian, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
+from probcal.simulate import chance_of
 
 TRIES = 3  # climbs by particles from one start
 
@@ -36,7 +37,7 @@ def solve_by_particles(
         first = solve_timed(near, MAP(trajectory="joint", engine="dense"), Gaussian(), silent, None, 1)
         start = first.posterior.point if first.status.valid and first.posterior.sound else None
         mirrors = first.mirrors if linear and start is not None and method.climbs else ()
-    drawn = np.random.default_rng(np.asarray(jax.random.key_data(jax.random.fold_in(context.key, 1))))
+    drawn = chance_of(jax.random.fold_in(context.key, 1))
     begin = problem.first_z if start is None else np.asarray(start.z)
     places = [begin, *drawn.standard_normal((starts - 1, len(begin)))]
     answers = []

@@ -49,6 +49,7 @@ from probcal.results.answer import (
 )
 from probcal.results.blocks import SensorBlocks
 from probcal.results.build import build_tracks
+from probcal.simulate import chance_of
 from probcal.status import CLIMB, Status, judge
 
 if TYPE_CHECKING:
@@ -231,7 +232,7 @@ def score_slope(paths: Paths, told: Louis, prior: np.ndarray, z: Any, levels: An
     until every sd is known to `SD_ERROR`.
     """
     paths, M = paths.along_paths(), len(z)
-    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    rng = chance_of(key)
     found, away, rows = ScoreSlope(told.information, np.full(M, np.inf), 0), np.zeros((0, M)), list[np.ndarray]()
     logs = np.zeros(0)
     while M and found.filters < FILTERED and not (found.sd_error <= SD_ERROR).all():

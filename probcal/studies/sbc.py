@@ -38,7 +38,7 @@ from probcal.modes.grid import follow_states
 from probcal.priors import AnyPrior, Precision, Prior, as_prior
 from probcal.problem import Problem
 from probcal.results.read import each_track, saved_states
-from probcal.simulate import Key, as_key
+from probcal.simulate import Key, as_key, chance_of
 from probcal.studies.coverage import judge_coverage
 from probcal.studies.prior_draws import check_drawable, draw_data, draw_prior, far_start
 from probcal.studies.quantities import TAKEN, Points, Pool, Trial, pool_of, ranked
@@ -240,7 +240,7 @@ class _Engine:
         keys = jax.random.split(jax.random.fold_in(self.key, number), 3)
         began = time.perf_counter()
         trial = self.trial(keys[0])
-        rng = np.random.default_rng(np.asarray(jax.random.key_data(keys[2])))
+        rng = chance_of(keys[2])
         try:
             found = self._fit(trial.problem, self._starting(trial), keys[1])
         except FitError as error:
