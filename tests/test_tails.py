@@ -17,11 +17,13 @@ from probcal.gaussian.mode import mixed_density
 from probcal.gaussian.recursion import trajectory
 from probcal.gaussian.tails import rewhitened
 from probcal.inference.fit import calibrate
+from probcal.inference.fitted import take_up
 from probcal.inference.model import Mixed
 from probcal.modes import automatic_start
 from probcal.motion import ConstantAcceleration, CoordinatedTurn, RandomWalk, White
 from probcal.noise import Bernoulli, Mixture, StudentT
 from probcal.results.read import each_track
+from probcal.types import float64
 
 FAMILIES = [StudentT(3.0), Mixture(0.2, 6.0)]
 START = {"position": ((0.0, 0.0), 2.0), "velocity": ((1.0, 0.0), 1.0)}
@@ -168,6 +170,11 @@ def test_a_climb_ends_where_naive_variational_bayes_does(family, motion):
     assert abs(tree.attrs["log_evidence_bound"] - bound) < 1e-3
     assert "log_evidence" not in tree.attrs
     assert answer.problem.model.tailed
+    again = float64(take_up)(problem, tree).problem  # with room for more epochs, of no target, which weigh as declared
+    (whole,), (mine,) = again.model.mixing[0], again.epochs[0].members.values()
+    np.testing.assert_array_equal(np.asarray(whole)[mine], found)
+    assert len(mine) > len(TIME)
+    assert (np.asarray(whole)[~mine] == 1.0).all()
 
 
 def sampled(family, count=60_000):
