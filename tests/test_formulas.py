@@ -13,7 +13,7 @@ from probcal import Channel, ConstantVelocity, Network, Node, Problem, Unknown, 
 from probcal.gaussian.dense import DenseEngine
 from probcal.gaussian.frame import _moves, _with_levels
 from probcal.gaussian.information import at_levels, update_levels
-from probcal.gaussian.linearised import laplace, noise_variances, predicted_variances
+from probcal.gaussian.linearised import laplace, marginal_variances
 from probcal.gaussian.mode import Point, cost, factors, find_mode
 from probcal.gaussian.recursion import trajectory
 from probcal.gaussian.tails import Variances
@@ -81,7 +81,7 @@ def test_a_predicted_value_is_as_uncertain_as_biases_and_trajectory_make_it():
         model, point = problem.model, resting(problem)
         covariance = jnp.asarray(exact("plane").z[1][np.ix_(order, order)])
         at = DenseEngine().at(model, point)
-        (variance,) = predicted_variances(model, at.rows, at.trajectories, covariance)
+        (variance,), _ = marginal_variances(model, at.rows, at.trajectories, covariance)
     np.testing.assert_allclose(np.asarray(variance)[np.asarray(model.rows[0].mask) > 0], expected, rtol=1e-8)
 
 
@@ -119,11 +119,11 @@ def test_what_data_determine_is_what_priors_leave():
         prior = Precision(jnp.ones(problem.model.biases))
         at = DenseEngine().at(problem.model, resting(problem))
         covariance = laplace(problem.model, at.point, prior).covariance
-        predicted = predicted_variances(problem.model, at.rows, at.trajectories, covariance)
+        predicted, driven = marginal_variances(problem.model, at.rows, at.trajectories, covariance)
         data = sum(
             float(np.sum(np.asarray(lin.weight) * np.asarray(own))) for lin, own in zip(at.rows, predicted, strict=True)
         )
-        noises = sum(float(np.sum(1 - np.asarray(own))) for own in noise_variances(at.trajectories, covariance))
+        noises = sum(float(np.sum(1 - np.asarray(own))) for own in driven)
     biases = np.sum(1 - np.diag(np.asarray(covariance)))
     assert data == pytest.approx(noises + biases, rel=1e-9)
     assert noises > 1.0

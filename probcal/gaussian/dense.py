@@ -17,8 +17,7 @@ from probcal.gaussian.linearised import (
     compress_and_eliminate,
     leverages,
     linearise_rows,
-    noise_variances,
-    predicted_variances,
+    marginal_variances,
     state_variances,
     trajectories_of,
 )
@@ -152,11 +151,11 @@ class DenseExpansion:
 
     def noises(self, factors: Factors) -> tuple[jax.Array, ...]:
         """Variance (E, n) of every whitened noise of each recursion."""
-        return noise_variances(self.trajectories, self.covariance(factors))
+        return marginal_variances(self.model, self.rows, self.trajectories, self.covariance(factors))[1]
 
     def predicted(self, factors: Factors) -> Data:
         """Variance (N, C) of each predicted value."""
-        return predicted_variances(self.model, self.rows, self.trajectories, self.covariance(factors))
+        return marginal_variances(self.model, self.rows, self.trajectories, self.covariance(factors))[0]
 
     def leverages(self, factors: Factors) -> Data:
         """Leverage of every datum (N, C) on the biases: w times the part of its variance that the

@@ -67,20 +67,14 @@ def state_variances(trajectories: Sequence[Trajectory], covariance: jax.Array) -
     )
 
 
-def noise_variances(trajectories: Sequence[Trajectory], covariance: jax.Array) -> tuple[jax.Array, ...]:
-    """Variance (E, n) of every whitened noise of each recursion, for a covariance (M, M) of z."""
-    xp = linalg.library(covariance, *jax.tree.leaves(trajectories))
-    known, covariance = jax.tree.map(xp.asarray, (tuple(trajectories), covariance))
-    return tuple(own.spread + (own.driven @ covariance * own.driven).sum(2) for own in known)
-
-
 @jax.jit
-def predicted_variances(
+def marginal_variances(
     model: Model, rows: Sequence[Linearised], trajectories: Sequence[Trajectory], covariance: jax.Array
-) -> Data:
-    """Variance (N, C) of each predicted value, biases and trajectories both uncertain."""
+) -> tuple[Data, tuple[jax.Array, ...]]:
+    """Variance (N, C) of each predicted value and (E, n) of every whitened noise, for a covariance (M, M) of z."""
     alone = model.state_variance(rows, [own.covariance for own in trajectories])
-    return jax.tree.map(jnp.add, alone, _by_bias(model, rows, trajectories, covariance))
+    predicted = jax.tree.map(jnp.add, alone, _by_bias(model, rows, trajectories, covariance))
+    return predicted, tuple(own.spread + jnp.sum(own.driven @ covariance * own.driven, 2) for own in trajectories)
 
 
 @jax.jit

@@ -310,7 +310,7 @@ def _stacked(columns: tuple[jax.Array, jax.Array]) -> list[jax.Array]:
 @jax.jit
 def _direction(solved: Eliminated, z: jax.Array, prior: Precision, damping: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Damped Newton step (M,) of the biases, and the slope of the cost along it at fixed trajectories."""
-    matrix = solved.information + prior.matrix() + damping * jnp.eye(len(z))
+    matrix = solved.information + prior._replace(alpha=prior.alpha + damping).matrix()
     dz = Dense.of(matrix).solve(solved.score - prior.pull(z))
     return dz, (solved.pull - prior.pull(z)) @ dz
 

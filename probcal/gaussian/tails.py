@@ -20,7 +20,7 @@ from probcal.gaussian.engine import Engine, Expansion, Factors
 from probcal.gaussian.factor import COLUMNS
 from probcal.gaussian.information import update_levels
 from probcal.gaussian.jointly import follow_biases
-from probcal.gaussian.linearised import noise_variances, predicted_variances
+from probcal.gaussian.linearised import marginal_variances
 from probcal.gaussian.mode import Point
 from probcal.model.model import Data, Mixing, Model, Recursion
 from probcal.model.rows import Linearised
@@ -43,8 +43,7 @@ class Variances(NamedTuple):
     @classmethod
     def dense(cls, at: DenseExpansion, covariance: jax.Array) -> "Variances":
         """Those for a covariance (M, M) of z; it can be traced."""
-        predicted = predicted_variances(at.model, at.rows, at.trajectories, covariance)
-        return cls(predicted, noise_variances(at.trajectories, covariance))
+        return cls(*marginal_variances(at.model, at.rows, at.trajectories, covariance))
 
 
 @jax.jit
