@@ -185,7 +185,7 @@ class Static(Component):
         return np.zeros((len(dt), dimension, 0))
 
 
-class _Named(Component):
+class OneComponent(Component):
     """One state component, a number unless it is `per_axis`."""
 
     name: str
@@ -201,7 +201,7 @@ class _Named(Component):
 
 
 @dataclass(frozen=True)
-class RandomWalk(_Named):
+class RandomWalk(OneComponent):
     """A scalar (or, `per_axis`, a vector) component that drifts: `std` in unit s^-1/2, `initial` = (mean, std)."""
 
     name: str
@@ -230,7 +230,7 @@ class RandomWalk(_Named):
 
 
 @dataclass(frozen=True)
-class Remembered(_Named):
+class Remembered(OneComponent):
     """The remembered noise of one channel of one sensor (`noise.Memory`), a state that the rows of this sensor read.
 
     `level` is the label of its std.
@@ -259,7 +259,7 @@ class Remembered(_Named):
 
 
 @dataclass(frozen=True)
-class White(_Named):
+class White(OneComponent):
     """A component drawn anew at every epoch (an unknown emission range, say): `mean` (one or one an axis), `std`."""
 
     memoryless: ClassVar[bool] = True
