@@ -36,6 +36,11 @@ MUTATIONS = [
     Mutation("expected = max(expected, float(usual))", "pass", "test_labels.py"),
     Mutation("moved[place[b]] -= apart", "moved[place[b]] += apart", "test_labels.py"),
     Mutation("2.0 * float(special.stdtr(df, -np.sqrt(df)))", "float(special.stdtr(df, -np.sqrt(df)))", "test_labels.py"),
+    # analysis/slopes.py, analysis/recoded.py
+    Mutation("np.minimum(self.fit.factors.diagonal(len(held)), most)", "self.fit.factors.diagonal(len(held))", "test_slopes.py"),
+    Mutation("information = (inverse[k] - np.diag(own[k]))", "information = inverse[k]", "test_slopes.py"),
+    Mutation("changes = [] if slopes.ratio > first else changes", "pass", "test_slopes.py"),
+    Mutation('f"look like {other}": lambda value: quarter - value,', "", "test_slopes.py"),
     # gaussian/selected.py
     Mutation("across.T, inner - down.T @ across", "across.T, inner", "test_sparse.py"),
     # gaussian/recursion.py

@@ -4,6 +4,8 @@ A check is a function of a `Case` with the decorator `check`, in a file of its o
 `probcal.analysis.checks.CHECKS`. `assess` runs all whose needs a fit meets and knows none by name.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -56,6 +58,16 @@ class Case:
         drawable = engine.cheap or (engine.exact and not many_data(self.fit.problem.model))
         facts = status.explains, status not in INVALID, engine.exact, drawable, self.truth is not None
         return frozenset(name for name, holds in zip(NEEDS, facts, strict=True) if holds)
+
+    @cached_property
+    def _known(self) -> dict[Callable[[Case], Any], Any]:
+        return {}
+
+    def once(self, of: Callable[[Case], Any]) -> Any:
+        """What a function finds of this case, for all checks that ask."""
+        if of not in self._known:
+            self._known[of] = of(self)
+        return self._known[of]
 
     @cached_property
     def drawn(self) -> predictive.FitDraws:

@@ -13,10 +13,12 @@ from probcal.analysis.open import check_open
 from probcal.analysis.outliers import check_outliers
 from probcal.analysis.parts import check_parts
 from probcal.analysis.process import check_process
+from probcal.analysis.recoded import check_recoded
 from probcal.analysis.rows import check_rows
 from probcal.analysis.scaling import check_scaling
 from probcal.analysis.segments import check_segments
 from probcal.analysis.shape import check_shape
+from probcal.analysis.slopes import check_slopes
 from probcal.analysis.wrapping import check_wrapping
 
 CHECKS: dict[str, Check] = {
@@ -27,10 +29,12 @@ CHECKS: dict[str, Check] = {
     "targets": check_parts("target"),
     "outliers": check_outliers,
     "wrapping": check_wrapping,
+    "recoded": check_recoded,
     "process": check_process,
     "open": check_open,
     "levels": check_levels,
     "segments": check_segments,
+    "slopes": check_slopes,
     "shape": check_shape,
     "mirrors": check_mirrors,
     "lags": check_lags,

@@ -10,7 +10,17 @@ from probcal.labels import listed
 
 NAMES = 4  # that a sentence on several channels lists
 
-FIRST = ("status", "wrapping", "drifting", "conflicting", "outliers", "level", "nis", "motion")  # likely causes
+FIRST = (
+    "status",
+    "wrapping",
+    "drifting",
+    "conflicting",
+    "outliers",
+    "slope",
+    "level",
+    "nis",
+    "motion",
+)  # likely causes
 LAST = ("predictive", "rest", "gain", "loo")  # and what says little of them
 
 

@@ -17,7 +17,43 @@ from probcal.linalg import invert, pseudo_inverse, solve_square, spectrum
 from probcal.model import variants
 
 Patterns = dict[str, np.ndarray]
+QUARTERS = 4
+COPIES = 2000  # most biases of all pieces together
+PARAMETERS = 4000  # most biases and differences together, where there are no matrices of all
+SUSPECT = 0.4  # share of the limit from which a bias is compared with others
+TOGETHER = 200  # parameters of these, at most
+HELD = 1e6  # times the information about a bias, all else known, by which a difference is held at zero
 LEAST = 1e-6  # information in z about a difference below which there is none to tell
+
+
+class Grid(NamedTuple):
+    """The pieces of a recording: parts of its time by groups of targets."""
+
+    part: np.ndarray  # (rows,) of the table: part of the time of each
+    group: np.ndarray  # (rows,) group of targets
+    edges: np.ndarray  # times at which the parts begin
+    groups: int
+
+    @property
+    def along(self) -> np.ndarray:
+        """The differences (rows, q) of each row: by the parts after the first, then by the groups after the first."""
+        return np.concatenate([np.eye(len(self.edges))[self.part][:, 1:], np.eye(self.groups)[self.group][:, 1:]], 1)
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """The numbers of the differences, from 1 on, between "halves" and between "targets"."""
+        parts = len(self.edges)
+        every = {"halves": np.arange(1, parts), "targets": np.arange(parts, parts + self.groups - 1)}
+        return {name: own for name, own in every.items() if len(own)}
+
+    @property
+    def patterns(self) -> Patterns:
+        """The bias and its differences (1 + q, k) for a unit change: of halves k = 1, of targets groups - 1."""
+        parts, every = len(self.edges), np.eye(len(self.edges) + self.groups - 1)
+        return {
+            name: every[:, own] if name == "targets" else every[:, own[2 * own // parts > 0]].sum(1, keepdims=True)
+            for name, own in self.columns.items()
+        }
 
 
 class Pieces(NamedTuple):
@@ -71,6 +107,22 @@ def with_differences(fit: Judged, along: np.ndarray) -> Expansion:
     return fit.engine.at(variants.differing(model, own), point, rows)
 
 
+def with_parameters(
+    fit: Judged, along: np.ndarray, tables: Sequence[np.ndarray], columns: Sequence[np.ndarray]
+) -> Expansion:
+    """The posterior at a fit with parameters, all zero, by which `columns` (N, C, k) add to the predictions of a block.
+
+    `tables` (S, k) say which each sensor of a block has, from M on; there are as many as `with_differences` has along
+    columns (rows, q) of the table, and at most q a bias that a block reads.
+    """
+    model, own = fit.problem.model, [along[index] for index in fit.problem.row_index]
+    rows = tuple(
+        lin._replace(bias=np.concatenate([lin.bias, more], 2)) for *_, lin, more in model.each_block(fit.lins, columns)
+    )
+    point = fit.point._replace(z=np.pad(fit.point.z, (0, along.shape[1] * model.biases)))
+    return fit.engine.at(variants.reading(variants.differing(model, own), tables), point, rows)
+
+
 def divide(fit: Judged, along: np.ndarray) -> Pieces:
     """The biases and their differences along columns (rows, q) of the rows of the table."""
     return of_expansion(fit, with_differences(fit, along))
@@ -110,7 +162,7 @@ def contrasts(pieces: Pieces, pattern: np.ndarray, free: Sequence[tuple[int, np.
         cross = columns.T @ crosses[:, m]
         information = columns.T @ G[:, m, :, m] @ columns - cross @ others @ cross.T
         score = columns.T @ g[:, m] - cross @ others @ pull
-        one = _contrast(information, score) if m in held else beside_level(information, score, LEAST)
+        one = contrast(information, score) if m in held else beside_level(information, score, LEAST)
         if one is not None:
             found[m] = one
     return found
@@ -122,10 +174,11 @@ def beside_level(information: np.ndarray, score: np.ndarray, least: float) -> Co
     if level[-1] <= least:
         return None
     score = score[:-1] - level[:-1] * score[-1] / level[-1]
-    return _contrast(information[:-1, :-1] - np.outer(level[:-1], level[:-1]) / level[-1], score, least)
+    return contrast(information[:-1, :-1] - np.outer(level[:-1], level[:-1]) / level[-1], score, least)
 
 
-def _contrast(information: np.ndarray, score: np.ndarray, least: float = LEAST) -> Contrast | None:
+def contrast(information: np.ndarray, score: np.ndarray, least: float = LEAST) -> Contrast | None:
+    """A contrast of information (q, q) and score (q,) along what they tell more than `least` of; None of nothing."""
     information = 0.5 * (information + information.T)
     values, vectors = spectrum(information)
     seen = values > least
@@ -187,3 +240,21 @@ def changing(pieces: Pieces, patterns: Patterns, inflation: Patterns, count: int
             break
         found.append(max(rest, key=lambda change: change.contrast.plausible / inflation[change.name][change.bias]))
     return found
+
+
+def grid_for(fit: Judged) -> Grid:
+    """Quarters of equal numbers of rows by targets; halves, and groups, where biases are many."""
+    data, M = fit.problem.measurements, fit.problem.model.biases
+    whole = fit.engine.cheap and QUARTERS * M <= COPIES
+    edges = _edges(data.time[data.measured.any(1)], QUARTERS if whole else 2)
+    most = COPIES // (len(edges) * M) if fit.engine.cheap else PARAMETERS // M - 1
+    groups = max(1, min(len(data.target_names), most))
+    return Grid(np.searchsorted(edges[1:], data.time, side="right"), data.target % groups, edges, groups)
+
+
+def _edges(time: np.ndarray, count: int) -> np.ndarray:
+    """Times at which pieces of equal numbers of rows begin; fewer where there are hardly any times."""
+    edges = np.quantile(time, np.arange(count) / count, method="inverted_cdf")
+    if len(np.unique(edges)) == count and len(np.unique(time)) >= 2 * count:
+        return edges
+    return _edges(time, 2) if count > 2 else edges[:1]

@@ -19,7 +19,8 @@ import xarray as xr
 from probcal.analysis import levels, pieces
 from probcal.analysis.check import Case, Checked, check
 from probcal.analysis.findings import Finding
-from probcal.analysis.pieces import Change, Contrast, Patterns, Pieces
+from probcal.analysis.pieces import HELD, SUSPECT, TOGETHER, Change, Contrast, Grid, Patterns, Pieces, grid_for
+from probcal.analysis.slopes import found_slopes
 from probcal.analysis.verdict import RATE, limit_of
 from probcal.gaussian.engine import Factors, Group, told_alone
 from probcal.inference import residuals
@@ -28,43 +29,6 @@ from probcal.labels import listed
 from probcal.linalg import invert
 from probcal.problem import Problem
 from probcal.results.groups import along, bias_coords
-
-QUARTERS = 4
-COPIES = 2000  # most biases of all pieces together
-PARAMETERS = 4000  # most biases and differences together, where there are no matrices of all
-SUSPECT = 0.4  # share of the limit from which a bias is compared with others
-TOGETHER = 200  # parameters of these, at most
-HELD = 1e6  # times the information about a bias, all else known, by which a difference is held at zero
-
-
-class Grid(NamedTuple):
-    """The pieces of a recording: parts of its time by groups of targets."""
-
-    part: np.ndarray  # (rows,) of the table: part of the time of each
-    group: np.ndarray  # (rows,) group of targets
-    edges: np.ndarray  # times at which the parts begin
-    groups: int
-
-    @property
-    def along(self) -> np.ndarray:
-        """The differences (rows, q) of each row: by the parts after the first, then by the groups after the first."""
-        return np.concatenate([np.eye(len(self.edges))[self.part][:, 1:], np.eye(self.groups)[self.group][:, 1:]], 1)
-
-    @property
-    def columns(self) -> dict[str, np.ndarray]:
-        """The numbers of the differences, from 1 on, between "halves" and between "targets"."""
-        parts = len(self.edges)
-        every = {"halves": np.arange(1, parts), "targets": np.arange(parts, parts + self.groups - 1)}
-        return {name: own for name, own in every.items() if len(own)}
-
-    @property
-    def patterns(self) -> Patterns:
-        """The bias and its differences (1 + q, k) for a unit change: of halves k = 1, of targets groups - 1."""
-        parts, every = len(self.edges), np.eye(len(self.edges) + self.groups - 1)
-        return {
-            name: every[:, own] if name == "targets" else every[:, own[2 * own // parts > 0]].sum(1, keepdims=True)
-            for name, own in self.columns.items()
-        }
 
 
 class Compared(NamedTuple):
@@ -89,7 +53,11 @@ def check_segments(case: Case) -> Checked:
     if compared is None:
         return Checked()
     problem, inflation, changes = case.fit.problem, compared.inflation, compared.changes
-    M = problem.model.biases
+    M, slopes, explains = problem.model.biases, case.once(found_slopes), ["levels"]
+    if changes and slopes is not None:  # the stronger counts
+        first = changes[0].square / limit_of(M, changes[0].contrast.freedom)
+        changes = [] if slopes.ratio > first else changes
+        explains.append("slopes")
     limit, groups, findings = limit_of(M), {}, []
     if compared.alone:
         groups["halves"] = group_of(problem, compared, grid)
@@ -115,25 +83,7 @@ def check_segments(case: Case) -> Checked:
         text = "more biases may have changed and were not compared: so many are rarely drifts of single biases"
         findings.append(Finding("halves", "fit", f"{compared.unsolved} {text}"))
     doubts = {"drifting": drifts, "conflicting": disagreements, "weak": weak}
-    return Checked(groups, findings, doubts, ["levels"] * bool(drifts), inflation, remarks)
-
-
-def grid_for(fit: Judged) -> Grid:
-    """Quarters of equal numbers of rows by targets; halves, and groups, where biases are many."""
-    data, M = fit.problem.measurements, fit.problem.model.biases
-    whole = fit.engine.cheap and QUARTERS * M <= COPIES
-    edges = _edges(data.time[data.measured.any(1)], QUARTERS if whole else 2)
-    most = COPIES // (len(edges) * M) if fit.engine.cheap else PARAMETERS // M - 1
-    groups = max(1, min(len(data.target_names), most))
-    return Grid(np.searchsorted(edges[1:], data.time, side="right"), data.target % groups, edges, groups)
-
-
-def _edges(time: np.ndarray, count: int) -> np.ndarray:
-    """Times at which pieces of equal numbers of rows begin; fewer where there are hardly any times."""
-    edges = np.quantile(time, np.arange(count) / count, method="inverted_cdf")
-    if len(np.unique(edges)) == count and len(np.unique(time)) >= 2 * count:
-        return edges
-    return _edges(time, 2) if count > 2 else edges[:1]
+    return Checked(groups, findings, doubts, explains if changes else [], inflation, remarks)
 
 
 def compare_segments(
@@ -193,7 +143,7 @@ class _Differences:
         return inverse - np.asarray(own)[..., None] * np.eye(members.shape[1]), score
 
     def own_shift(self, name: str) -> list[jax.Array]:
-        """Shift of the biases (N, p) of each row, each member of a pattern with its own."""
+        """By how much the predictions (N, C) of each block move, each member of a pattern with a bias of its own."""
         M, columns = len(self.alpha), [0, *self.grid.columns[name]]
         copies = np.eye(len(columns))
         copies[:, 0] = 1.0  # each is the bias and its difference
@@ -204,10 +154,10 @@ class _Differences:
         step = np.pad(np.reshape(self.at.solve(factors, self.at.slope()), (-1, M)), ((0, 0), (0, 1)))
         times = np.pad(self.grid.along, ((0, 0), (1, 0)), constant_values=1.0)[:, columns]
         model = self.fit.problem.model
-        parts = model.each_block(self.fit.problem.row_index, model.read)
+        parts = model.each_block(self.fit.problem.row_index, model.read, self.fit.lins)
         return [
-            jax.device_put(sum(times[own][:, [k]] * step[j][read] for k, j in enumerate(columns)))
-            for *_, own, read in parts
+            jax.device_put(np.einsum("ncp,nk,knp->nc", lin.bias, times[own], step[columns][:, read], optimize=True))
+            for *_, own, read, lin in parts
         ]
 
     def _alone(self, name: str) -> Iterator[tuple[int, Contrast]]:

@@ -11,7 +11,8 @@ not learn) and explains a
 prior only   s < 0.05
 weak         s < 0.5 (information below 1), or one scale along a combination of biases that the data leave open would
              put it more than 1.8 sd off, or it would move by more than one sd with the noise levels
-             that the data ask for or if the biases that drift were free to, or it lies beyond the
+             that the data ask for or if the biases that drift were free to, or if what a channel leaves follows the
+             geometry (`analysis.slopes`), or it lies beyond the
              limit of its survey by a misfit that is mostly elsewhere, or it is another one in an
              answer that fits as well (a mirror, all biases where a target touches it), or the
              answer is far from Gaussian, or it is a clock and another lag may explain the

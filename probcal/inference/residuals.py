@@ -120,15 +120,13 @@ def _innovations(
     shift: list[jax.Array],
     root: jax.Array,
 ) -> list[tuple[jax.Array, jax.Array, jax.Array]]:
-    """Of each block: innovations with the biases of every row moved by `shift` (N, p) in z, the sum of squares of their
-    responses to bias directions `root` (M, K), and the share of itself that S^-1/2 leaves a datum; each (N, C)."""
+    """Of each block: innovations with the predictions moved by `shift` (N, C), the sum of squares of their responses to
+    bias directions `root` (M, K), and the share of itself that S^-1/2 leaves a datum; each (N, C)."""
     columns = []
-    for lin, dz, along in zip(lins, shift, model.by_bias(lins, root), strict=True):
+    for lin, moved, along in zip(lins, shift, model.by_bias(lins, root), strict=True):
         size = jnp.sqrt(lin.weight)[:, :, None]
-        moved = jnp.einsum("ncp,np->nc", lin.bias, dz)[:, :, None]
-        columns.append(
-            jnp.concatenate([standardised(lin.score, lin.weight)[:, :, None] - size * moved, size * along], 2)
-        )
+        left = standardised(lin.score, lin.weight)[:, :, None] - size * moved[:, :, None]
+        columns.append(jnp.concatenate([left, size * along], 2))
     mixed = model.state_variance(lins, [known.mix for known in filters])
     kept = [1.0 + lin.weight * own for lin, own in zip(lins, mixed, strict=True)]
     drifts = [
@@ -184,8 +182,7 @@ def innovations(fit: Judged, kurtosis: np.ndarray, dz: np.ndarray | None = None)
     """
     model = fit.problem.model
     filters, roots = prepare(fit.expansion.eliminated), fit.roots
-    moved = np.zeros(model.biases + 1) if dz is None else np.append(dz, 0.0)
-    shift = [jax.device_put(moved[np.asarray(read)]) for read in model.read]
+    shift = moved_predictions(fit, np.zeros(model.biases) if dz is None else dz)
     found = [_innovations(model, fit.point, fit.lins, filters, shift, part) for part in roots]
     value, _, kept = (fit.flat(parts) for parts in zip(*found[0], strict=True))
     used = np.sum([fit.flat([own for _, own, _ in part]) for part in found], axis=0)
@@ -197,8 +194,15 @@ def innovations(fit: Judged, kurtosis: np.ndarray, dz: np.ndarray | None = None)
     )
 
 
+def moved_predictions(fit: Judged, dz: np.ndarray) -> list[jax.Array]:
+    """By how much biases moved by dz (M,) move the predictions (N, C) of each block, tracks held."""
+    padded, model = np.append(dz, 0.0), fit.problem.model
+    parts = model.each_block(fit.lins, model.read)
+    return [jax.device_put(np.einsum("ncp,np->nc", lin.bias, padded[read])) for *_, lin, read in parts]
+
+
 def moved_innovations(fit: Judged, known: Filtered, shift: list[jax.Array]) -> np.ndarray:
-    """Innovations (D,) with the biases of every row of each block moved by `shift` (N, p) in z."""
+    """Innovations (D,) with the predictions of each block moved by `shift` (N, C)."""
     model = fit.problem.model
     found = _innovations(model, fit.point, fit.lins, known.filters, shift, known.roots[0])
     return fit.flat([value for value, _, _ in found])

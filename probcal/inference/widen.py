@@ -170,10 +170,10 @@ def _noises(fit: Judged, rejected: Rejection, rng: np.random.Generator) -> tuple
         fresh = np.sqrt(1.0 - again**2) * white[order]
         fresh[0] = white[order[0]]
         red[order] = np.sqrt(size) * signal.lfilter([1.0], [1.0, -again], fresh, axis=0)
-    return _in_blocks(fit, white), _in_blocks(fit, red)
+    return in_blocks(fit, white), in_blocks(fit, red)
 
 
-def _in_blocks(fit: Judged, values: np.ndarray) -> Data:
+def in_blocks(fit: Judged, values: np.ndarray) -> Data:
     """Values by datum (D, K) as those of the blocks (N, C, K), zero where nothing is measured."""
     found, start = [], 0
     for there, pick in zip(fit.problem.model.measured, fit.picks, strict=True):

@@ -149,6 +149,20 @@ def differing(model: Model, along: Sequence[np.ndarray]) -> Model:
     return replace(model.with_rows(stepped, along), blocks=blocks, biases=(1 + q) * M, tilt=None)
 
 
+def reading(model: Model, tables: Sequence[np.ndarray]) -> Model:
+    """A model of `differing` whose sensors read further parameters by tables (S, k), which move no prediction.
+
+    They take the places of the differences, so that kernels made for these serve.
+    """
+
+    def own(data: Rows, table: np.ndarray) -> dict[str, Any]:
+        p, again = data.bias.shape[1] - table.shape[1], len(data.bias) // max(len(table), 1)
+        bias = np.concatenate([np.asarray(data.bias)[:, :p], np.tile(table, (again, 1))], 1)
+        return {"bias": bias, "scale": np.where(np.arange(bias.shape[1]) < p, data.scale, 0.0)}
+
+    return model.with_rows(own, tables)
+
+
 @partial(jax.jit, inline=True)
 def placed(model: Model, mine: Sequence[jax.Array], place: jax.Array) -> Model:
     """The first node of the rows `mine` (N,) of each block moved to a place (d,)."""
