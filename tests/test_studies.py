@@ -90,10 +90,10 @@ def test_c1_at_one_share_reproduces_the_trial_and_equals_single_fits():
 
 @pytest.mark.ci
 def test_each_fit_of_a_study_is_that_of_fit_alone():
-    """Of run 7 a bias lies beyond ten scales on the way and comes back; of runs 0 and 8 maximum likelihood diverges."""
-    methods = {"ml": (MAP(), Flat()), "map": MAP(), "ea-printed": EA.as_printed()}
-    found = study(radars.setting, {"scenario": ["C2"]}, methods, runs=[0, 7, 8]).sel(scenario="C2")
-    assert found["status"].sel(estimator="ml").values.tolist() == ["diverged", "converged", "diverged"]
+    """Of run 7 a bias lies beyond ten scales on the way and comes back; of run 8 maximum likelihood diverges."""
+    methods = {"ml": (MAP(), Flat()), "ea-printed": EA.as_printed()}
+    found = study(radars.setting, {"scenario": ["C2"]}, methods, runs=[7, 8]).sel(scenario="C2")
+    assert found["status"].sel(estimator="ml").values.tolist() == ["converged", "diverged"]
     for run in found["run"].values:
         problem, _ = radars.setting(run, scenario="C2")
         for name, value in methods.items():
