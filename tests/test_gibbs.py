@@ -216,6 +216,17 @@ def test_a_bias_that_bends_what_is_measured_has_its_posterior(away, engine):
 
 
 @pytest.mark.ci
+def test_an_interrupted_run_says_how_many_draws_it_has():
+    def stop(progress):
+        if progress.done >= 50:
+            raise KeyboardInterrupt
+
+    problem = worlds.linear("plane")[0]
+    cut = pc.fit(problem, Gibbs(**SHORT), key=3, start=worlds.resting(problem), progress=stop)
+    assert "Interrupted after 25 of 50 draws a chain" in cut.attrs["message"]
+
+
+@pytest.mark.ci
 def test_more_sweeps_a_draw_begin_the_sums_anew():
     """Of draws two sweeps apart what is summed are the sweeps since, of all chains."""
     problem = drawn()[0]
