@@ -1,6 +1,6 @@
 """Notebooks: what is committed is whole and uses names that exist; one runs in CI, the others with `-m slow`.
 
-What the second declares, a sensor of one's own, README.md declares too, whose examples run in CI.
+The recording of the first is fitted by `test_endtoend.py`.
 """
 
 import ast
@@ -14,7 +14,7 @@ import pytest
 from probcal.wings import loaded
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
-SAMPLE = ("01_quickstart",)
+SAMPLE = ("02_declare_a_sensor",)
 LARGEST = 300_000  # bytes of a notebook with its outputs
 
 every = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

@@ -775,8 +775,11 @@ def test_every_verb_and_method_runs_on_every_engine_or_says_why_not(name, forced
             np.testing.assert_allclose(own, wanted, rtol=close, atol=close * np.abs(wanted).max())
 
 
-@pytest.mark.ci
-@pytest.mark.parametrize("step", [pc.EM(pc.Unscented()), pc.EMEA()], ids=lambda own: own.name)
+@pytest.mark.parametrize(
+    "step",
+    [pytest.param(pc.EM(pc.Unscented()), marks=pytest.mark.slow), pytest.param(pc.EMEA(), marks=pytest.mark.ci)],
+    ids=lambda own: own.name,
+)
 def test_em_on_any_engine_is_that_of_the_dense_one(step):
     problem, start = engines.world().problem, engines.world().start
     engined = (replace(step, iterations=20, engine=name) for name in ("dense", "superlu"))

@@ -122,7 +122,7 @@ def test_runs_that_survey_other_nodes_keep_their_own_priors():
     assert (both != other).all()
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_study_whose_fits_are_more_than_one_climb_runs_them_as_fit_does():
     @probcal.sensor(range=probcal.Channel("m", std=1.0))
     def anchor(target, pose, *, offset=probcal.Bias("m", 6.0, shared="type")):
