@@ -37,6 +37,7 @@ from probcal.inference.fitted import take_up
 from probcal.inference.solve import _on_engine
 from probcal.modes import automatic_start
 from probcal.results.blocks import SensorBlocks
+from probcal.types import float64
 
 
 def fitted(method, prior=None):
@@ -775,13 +776,11 @@ def test_every_verb_and_method_runs_on_every_engine_or_says_why_not(name, forced
             np.testing.assert_allclose(own, wanted, rtol=close, atol=close * np.abs(wanted).max())
 
 
-@pytest.mark.parametrize(
-    "step",
-    [pytest.param(pc.EM(pc.Unscented()), marks=pytest.mark.slow), pytest.param(pc.EMEA(), marks=pytest.mark.ci)],
-    ids=lambda own: own.name,
-)
+@pytest.mark.ci
+@pytest.mark.parametrize("step", [pc.EM(pc.Unscented()), pc.EMEA()], ids=lambda own: own.name)
 def test_em_on_any_engine_is_that_of_the_dense_one(step):
-    problem, start = engines.world().problem, engines.world().start
+    problem = worlds.small()
+    start = float64(automatic_start)(problem)
     engined = (replace(step, iterations=20, engine=name) for name in ("dense", "superlu"))
     one, other = (calibrate(problem, own, start=start)[0]["calibration"] for own in engined)
     for name in ("mean", "sd", "gamma", "precision"):
