@@ -79,7 +79,7 @@ CORRELATED = {"*.heading": 0.6}
     [
         ("loud", pc.MAP(tolerance=1e-3), pc.Gaussian()),
         ("loud", pc.MAP(tolerance=1e-3, trajectory="joint"), pc.Gaussian()),
-        ("drawn", pc.LeastSquares(), pc.Flat()),
+        ("plane", pc.LeastSquares(), pc.Flat()),
         ("drawn", pc.MAP(), pc.Gaussian(correlation=CORRELATED)),
         ("drawn", pc.EA(), pc.Horseshoe(kinds={"*.heading": pc.Gaussian(correlation=CORRELATED)})),
     ],
@@ -87,7 +87,7 @@ CORRELATED = {"*.heading": 0.6}
 def test_unknown_noise_and_correlated_priors_end_where_the_dense_form_does(world, method, prior, monkeypatch):
     """Unknown levels, heavy tails of data and process noise: by the same turns. Precisions: by propagation in both."""
     monkeypatch.setattr("probcal.inference.ea.MANY", 0)
-    problem = loud() if world == "loud" else drawn()[0]
+    problem = {"loud": loud, "plane": lambda: worlds.linear("plane")[0], "drawn": lambda: drawn()[0]}[world]()
     one, other = (calibrate(problem, replace(method, engine=engine), prior=prior) for engine in ("dense", "cholmod"))
     a, b = (tree["calibration"].to_dataset() for tree, _ in (one, other))
     assert one[0].attrs["status"] == other[0].attrs["status"] == "converged"
