@@ -118,6 +118,8 @@ def pytest_collection_modifyitems(items):
             item.add_marker("ci")
         if item.get_closest_marker("slow"):  # the later of two tiers counts
             item.own_markers = [mark for mark in item.own_markers if mark.name != "ci"]
+            if item.get_closest_marker("ci"):
+                raise pytest.UsageError(f"{item.nodeid} is slow and its module ci: mark the others of it one by one")
         needed = [wing for mark in item.iter_markers("needs") for wing in mark.args]
         if gone := missing(needed):
             item.add_marker(pytest.mark.skip(reason=f"wings not installed: {', '.join(gone)}"))

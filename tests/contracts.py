@@ -2,6 +2,7 @@
 
 import numpy as np
 
+import probcal
 from probcal.results.read import each_track
 from probcal.status import Status
 
@@ -50,3 +51,14 @@ def close(found, expected, tolerance=TOLERANCE):
     found, expected = np.asarray(found), np.asarray(expected)
     assert found.dtype == np.float64
     np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance * np.abs(expected).max())
+
+
+def judged_alike(problem, *trees):
+    """The verdicts on two trees of one fit are the same in every number."""
+    one, other = (probcal.assess(problem, tree) for tree in trees)
+    assert {node.path for node in one.subtree} == {node.path for node in other.subtree}
+    for node in one.subtree:
+        for variable, values in node.to_dataset(inherit=False).data_vars.items():
+            np.testing.assert_array_equal(
+                other[node.path][variable].values, values.values, err_msg=f"{node.path} {variable}"
+            )

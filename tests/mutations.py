@@ -116,7 +116,7 @@ MUTATIONS = [
     Mutation("0.0) * self.q2).gain", "1.0) * self.q2).gain", "test_crossings.py"),
     Mutation("score = np.einsum(\"bij,bj->bi\", inverse, step[members]) +", "score = 0.0 * step[members] +", "test_segments.py"),
     Mutation("self.held = HELD * (1.0 +", "self.held = 0.0 * (1.0 +", "test_segments.py"),
-    Mutation("return weight + posed.frame.log_likelihood(theta) - 0.5 * square + volume", "return weight - 0.5 * square + volume", "test_mirrors.py"),
+    Mutation("return weight + posed.frame.log_likelihood(theta) - 0.5 * square + volume", "return weight - 0.5 * square + volume", "test_mixing.py"),
     Mutation("change / (1.0 + change * row[m])", "change / (1.0 - change * row[m])", "test_relevance.py"),
     # inference/integrate.py, propagate.py
     Mutation("information @ z + score - 0.5", "information @ z - score - 0.5", "test_integrate.py"),

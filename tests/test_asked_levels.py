@@ -86,14 +86,13 @@ def test_slope_and_curvature_are_those_of_the_evidence():
     np.testing.assert_allclose(precision, curvature, rtol=0.06)
 
 
-@pytest.mark.ci
 @pytest.mark.parametrize(
     ("name", "times"),
     [
-        ("place", 2.0),
+        pytest.param("place", 2.0, marks=pytest.mark.slow),
         pytest.param("place", 0.4, marks=pytest.mark.ci),
-        pytest.param("rate", 4.0, marks=pytest.mark.ci),
-        ("motion", 1.6),
+        pytest.param("rate", 4.0, marks=pytest.mark.slow),
+        pytest.param("motion", 1.6, marks=pytest.mark.ci),
     ],
 )
 def test_a_level_that_is_declared_wrong_is_named_with_what_the_data_ask_for(name, times):

@@ -83,7 +83,9 @@ def hessian(problem, precision):
     return covariance[:M, :M], np.split(variances, np.cumsum(sizes)[:-1])
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.ci) for name in ("extras", "mixed")])
+@pytest.mark.parametrize(
+    "name", [pytest.param("extras", marks=pytest.mark.slow), pytest.param("mixed", marks=pytest.mark.ci)]
+)
 def test_the_bound_of_a_linear_problem_is_the_inverse_hessian(name):
     network, motion, table, fixed = LINEAR[name]()
     gauge = {"mixed": {"box.clock": 0.3}}.get(name, {})  # beside a free difference_offset

@@ -183,7 +183,7 @@ def check_fixed_point(tree, problem):
     np.testing.assert_allclose(group["precision"].values[learnt] * z[learnt] ** 2, gamma[learnt], rtol=0.1)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_small_mixed_network_is_fitted_from_the_table_alone():
     """Radars, one of them moving, and time differences; asynchronous and missing rows, a start found in the data."""
     walk = Path([0.0, 30.0], [CORNERS[2][0], CORNERS[2][5]], [0.0, 0.5])

@@ -66,7 +66,7 @@ def on_the_wrong_side(problem, label, shift):
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("form", ["dense", *(pytest.param(f, marks=pytest.mark.ci) for f in ("cholmod", "iterative"))])
+@pytest.mark.parametrize("form", ["dense", "cholmod", pytest.param("iterative", marks=pytest.mark.slow)])
 def test_a_node_that_stands_on_the_other_side_is_found(form):
     """The path bends by 4 m, which tells the sides apart; every climb begins on the stated one."""
     problem = beside(0, 4.0, **{"b0.position_y": -20.0})

@@ -34,11 +34,11 @@ def test_plaza_is_calibrated_from_the_command_line(tmp_path):
     assert np.isfinite(summary.select_dtypes("number").to_numpy()).all()
     html = (tmp_path / "fit" / "report.html").read_text().replace("<wbr>", "")
     assert "beacon_5.range_scale" in html
-    again = run("report", tmp_path / "fit")
-    assert again.returncode == 0, again.stderr
-    tracked = run("track", PLAZA, "--calibration", tmp_path / "fit", "--out", tmp_path / "tracks.csv")
-    assert tracked.returncode == 0, tracked.stderr
-    assert "after 0.40" in tracked.stdout
+    code, _, err = call("report", tmp_path / "fit")
+    assert code == 0, err
+    code, out, err = call("track", PLAZA, "--calibration", tmp_path / "fit", "--out", tmp_path / "tracks.csv")
+    assert code == 0, err
+    assert "after 0.40" in out
     tracks = pd.read_csv(tmp_path / "tracks.csv")
     assert len(tracks) == 1816
     assert (tracks["position_x_sd"] > 0).all()

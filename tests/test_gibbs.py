@@ -216,23 +216,14 @@ def test_a_bias_that_bends_what_is_measured_has_its_posterior(away, engine):
 
 
 @pytest.mark.ci
-def test_an_interrupted_run_goes_on_to_the_same_draws(tmp_path):
-    """Stopped after a chunk, resumed: every draw is that of a run without a stop, bit for bit."""
-    problem, method = worlds.linear("plane")[0], Gibbs(**SHORT)
-    start = worlds.resting(problem)
-    whole = pc.fit(problem, method, key=3, start=start)
-
+def test_an_interrupted_run_says_how_many_draws_it_has():
     def stop(progress):
         if progress.done >= 50:
             raise KeyboardInterrupt
 
-    cut = pc.fit(problem, method, key=3, start=start, store=tmp_path / "draws", progress=stop)
+    problem = worlds.linear("plane")[0]
+    cut = pc.fit(problem, Gibbs(**SHORT), key=3, start=worlds.resting(problem), progress=stop)
     assert "Interrupted after 25 of 50 draws a chain" in cut.attrs["message"]
-    again = pc.fit(problem, method, key=3, start=start, store=tmp_path / "draws", resume=True)
-    for group in ("posterior", "sample_stats", "calibration"):
-        for name, values in whole[group].data_vars.items():
-            np.testing.assert_array_equal(again[group][name].values, values.values, err_msg=name)
-    np.testing.assert_array_equal(again["track/one"]["sd"].values, whole["track/one"]["sd"].values)
 
 
 @pytest.mark.ci

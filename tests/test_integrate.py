@@ -1,5 +1,7 @@
 """Precisions integrated: against importance sampling on hand-made likelihoods, and what a fit says of them."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -73,7 +75,12 @@ def mixture(prior, matrix=G, pull=PULL, group=(0, 1, 2), key=0):
 
 def weighed(prior):
     """The same by importance sampling: hyper-parameters from their prior, each weighed by its evidence."""
-    kind = kind_of(prior)
+    return weighed_of(PRIORS.index(prior))
+
+
+@cache
+def weighed_of(number):
+    kind = kind_of(PRIORS[number])
     with jax.enable_x64(True):
 
         @jax.jit

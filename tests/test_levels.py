@@ -41,7 +41,7 @@ def gauges(std):
     return Network([kind.on(Node(f"gauge_{k}", p)) for k, p in enumerate(CORNERS)])
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_unknown_noise_and_process_noise_are_estimated_along():
     motion = probcal.Target(ConstantVelocity(1.5), {"position": ((30.0, 30.0), 1.0), "velocity": (0.0, 1.0)})
     run = simulate(gauges(2.0), motion, np.arange(0, 60, 0.5), key=3, share=0.3)

@@ -34,6 +34,7 @@ import networks
 from contracts import only
 
 PLACES = [(0, 0), (40, 3), (80, -2), (120, 1)]
+SCENES = ((3, "cholmod"), (1, "iterative"))  # beside the one of the tests of CI: seeds and engines
 
 
 def beside(seed, kind=ranger, share=0.3):
@@ -136,7 +137,7 @@ def test_a_piece_on_the_wrong_side_is_turned():
 
 @pytest.mark.ci
 @pytest.mark.parametrize(
-    ("seed", "form"), [(1, "cholmod"), pytest.param(3, "cholmod", marks=pytest.mark.ci), (1, "iterative")]
+    ("seed", "form"), [(1, "cholmod"), *(pytest.param(*own, marks=pytest.mark.slow) for own in SCENES)]
 )
 def test_a_scene_on_the_wrong_side_is_turned_in_sparse_form(seed, form):
     """From the whole track reflected, 20 m off at the most: `converged` there, before other sides were looked at."""
@@ -151,7 +152,7 @@ def test_a_scene_on_the_wrong_side_is_turned_in_sparse_form(seed, form):
     assert off(only(tree)["mean"].values, path) < 4
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_pieces_are_looked_at_again_where_the_scene_went_over():
     """The scene reflected fits better by 16 nats, and from there a piece of it by 17 more: 21 m off before."""
     problem, path = beside(53)
@@ -194,8 +195,8 @@ def test_a_short_piece_of_one_of_two_targets_is_turned(seed, form):
     [
         (probcal.MAP(engine="cholmod"), probcal.Gaussian()),
         (probcal.MAP(engine="iterative"), probcal.Gaussian()),
-        pytest.param(probcal.EA(engine="cholmod"), None, marks=pytest.mark.ci),
-        pytest.param(probcal.Gibbs(chains=1, warmup=5, draws=20, patience=1), probcal.Gaussian(), marks=pytest.mark.ci),
+        (probcal.EA(engine="cholmod"), None),
+        (probcal.Gibbs(chains=1, warmup=5, draws=20, patience=1), probcal.Gaussian()),
     ],
     ids=["map", "iterative", "ea", "gibbs"],
 )
@@ -459,7 +460,7 @@ def test_a_further_answer_that_no_fit_confirms_is_kept_as_it_was_found(monkeypat
     assert listed(found) == [("across", -0.5, 4.0)]
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_chains_on_two_sides_are_judged_where_the_reported_answer_lies():
     """Not between the sides, where no datum fits."""
     problem, _ = networks.setting(0, "line", share=1.0)

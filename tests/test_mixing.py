@@ -11,6 +11,7 @@ import probcal
 from probcal import Collapsed, Gaussian, Problem
 from probcal.gaussian.frame import frame_at, log_joint, log_weight, unit_normals, volume
 from probcal.inference import sampling
+from probcal.inference.collapsed import CollapsedState
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.leaps import Place, leap
 from probcal.inference.mixed import settled, weights_of_sides
@@ -130,6 +131,30 @@ def test_a_shift_to_the_other_side_and_back_is_none():
     np.testing.assert_allclose(back.theta, at.theta, atol=1e-8)
     np.testing.assert_allclose(back.eps[0], at.eps[0], atol=1e-5)
     np.testing.assert_allclose(back.weight, at.weight, atol=1e-5)
+
+
+@pytest.mark.ci
+def test_a_collapsed_chain_crosses_by_the_ratio_of_the_densities():
+    """The gain is the difference of the joint densities and the logarithm of what the map of the biases stretches."""
+    with jax.enable_x64(True):
+        form, (here, there), at = two_sides()
+        chain = CollapsedState(*at, jax.random.key(0))
+
+        @jax.jit
+        def crossed(here, there, chain):
+            def moved(theta):
+                return METHOD.across(form, here, there, chain._replace(theta=theta))[0].theta
+
+            over, gain = METHOD.across(form, here, there, chain)
+            ends = [
+                log_joint(posed.model, posed.frame, end.theta, end.eps) + log_prior(form, posed, end.theta, {})
+                for posed, end in ((there, over), (here, chain))
+            ]
+            return over, gain, ends[0] - ends[1], jax.jacfwd(moved)(chain.theta)
+
+        over, gain, difference, stretched = crossed(here, there, chain)
+    assert not np.allclose(over.theta, at.theta, atol=0.1)
+    np.testing.assert_allclose(gain, float(difference) + np.linalg.slogdet(stretched)[1], rtol=1e-8)
 
 
 def test_where_the_frame_is_exact_every_leap_is_taken():

@@ -3,6 +3,7 @@
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -254,25 +255,18 @@ def test_sigterm_before_an_answer_ends_a_command(model, tmp_path):
 
 @pytest.mark.ci
 @pytest.mark.needs("studies")
-def test_an_interrupted_study_says_what_it_keeps(model, tmp_path):
-    model.write_text(MODEL + STUDY)
-    process = started("study", model, "--methods", "ml", "--runs", 100_000, "--out", tmp_path / "out")
-    told(process, "fits: ")
-    told(process, "fits: ")
-    process.send_signal(signal.SIGINT)
-    _, complaint = process.communicate(timeout=200)
-    assert process.returncode == 130
+def test_an_interrupted_study_says_what_it_keeps(default_ctrl_c, tmp_path, monkeypatch):
+    @contextmanager
+    def shown():
+        yield lambda at: at.done and signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("probcal.studies.run_study.shown", shown)
+    model = tmp_path / "rulers.py"
+    model.write_text("from worlds import heights\n\n\ndef setting(run):\n    return heights(run)\n")
+    code, _, complaint = call("study", model, "--methods", "ml", "--runs", 40, "--out", tmp_path / "out")
+    assert code == 130
     assert "--resume goes on with it" in complaint
     assert "Traceback" not in complaint
-
-
-STUDY = """
-
-def setting(run):
-    made = problem()
-    drawn = simulate(made.network, made.motion, np.arange(12.0), key=run)
-    return Problem(made.network, made.motion, drawn.table), drawn.truth
-"""
 
 
 @pytest.mark.ci

@@ -558,7 +558,9 @@ GOOD = {  # members of which other values make a filter: counts, times and what 
 
 @pytest.mark.ci
 @pytest.mark.parametrize(
-    "method", [pc.AugmentedFilter(lag=8, jumps=pc.Jumps()), pc.ParticleFilter(20)], ids=["augmented", "particles"]
+    "method",
+    [pc.AugmentedFilter(lag=8, jumps=pc.Jumps()), pytest.param(pc.ParticleFilter(20), marks=pytest.mark.slow)],
+    ids=["augmented", "particles"],
 )
 def test_a_changed_state_is_one_sentence_or_as_good(method):
     whole, refused = filtered(method, rows()[:24], chunk=6), Counter()

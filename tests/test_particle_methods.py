@@ -412,14 +412,23 @@ def test_a_target_that_no_road_explains_has_a_status():
     assert np.isfinite(tree["track/target"]["mean"].values).all()
 
 
+def unexplained():
+    """Rows far from every road."""
+    rows = [(t, s, 4.0 * t, 300.0 + t) for t in np.arange(8.0) for s in ("known", "a", "b")]
+    table = pd.DataFrame(rows, columns=["time", "sensor", "place_x", "place_y"])
+    return Problem(offsets(), Road(CROSS, std=0.3, speed=(4.0, 0.5)), table)
+
+
 @pytest.mark.ci
 def test_em_by_particles_says_where_nothing_explains_the_rows():
-    network, far = offsets(), np.arange(8.0)
-    rows = [(t, s, 4.0 * t, 300.0 + t) for t in far for s in ("known", "a", "b")]
-    table = pd.DataFrame(rows, columns=["time", "sensor", "place_x", "place_y"])
-    problem = Problem(network, Road(CROSS, std=0.3, speed=(4.0, 0.5)), table)
+    problem = unexplained()
     tree = fit(problem, EM(Particles(100), iterations=10), prior=Gaussian())
     assert tree.attrs["status"] == "misfit"
+
+
+@pytest.mark.slow
+def test_particle_gibbs_says_where_nothing_explains_the_rows():
+    problem = unexplained()
     tree = fit(problem, ParticleGibbs(chains=1, warmup=0, draws=25, particles=Particles(20)), prior=Gaussian())
     assert tree.attrs["status"] == "misfit"
 

@@ -370,7 +370,13 @@ def mixed(dimension):
 @pytest.mark.ci
 @pytest.mark.parametrize(
     ("dimension", "update", "kind"),
-    [(2, "extended", "cphd"), (2, "cubature", "phd"), (3, "extended", "phd"), (3, "cubature", "cphd")],
+    [
+        (2, "extended", "cphd"),
+        (3, "cubature", "phd"),
+        pytest.param(2, "cubature", "phd", marks=pytest.mark.slow),
+        pytest.param(3, "extended", "phd", marks=pytest.mark.slow),
+        pytest.param(3, "cubature", "cphd", marks=pytest.mark.slow),
+    ],
 )
 def test_sensors_of_several_kinds_in_space(dimension, update, kind):
     """Range, azimuth and height beside azimuth alone: two objects are counted, and where they are is found."""

@@ -37,6 +37,7 @@ from probcal.inference.fitted import take_up
 from probcal.inference.solve import _on_engine
 from probcal.modes import automatic_start
 from probcal.results.blocks import SensorBlocks
+from probcal.types import float64
 
 
 def fitted(method, prior=None):
@@ -78,7 +79,7 @@ CORRELATED = {"*.heading": 0.6}
     [
         ("loud", pc.MAP(tolerance=1e-3), pc.Gaussian()),
         ("loud", pc.MAP(tolerance=1e-3, trajectory="joint"), pc.Gaussian()),
-        ("drawn", pc.LeastSquares(), pc.Flat()),
+        ("plane", pc.LeastSquares(), pc.Flat()),
         ("drawn", pc.MAP(), pc.Gaussian(correlation=CORRELATED)),
         ("drawn", pc.EA(), pc.Horseshoe(kinds={"*.heading": pc.Gaussian(correlation=CORRELATED)})),
     ],
@@ -86,7 +87,7 @@ CORRELATED = {"*.heading": 0.6}
 def test_unknown_noise_and_correlated_priors_end_where_the_dense_form_does(world, method, prior, monkeypatch):
     """Unknown levels, heavy tails of data and process noise: by the same turns. Precisions: by propagation in both."""
     monkeypatch.setattr("probcal.inference.ea.MANY", 0)
-    problem = loud() if world == "loud" else drawn()[0]
+    problem = {"loud": loud, "plane": lambda: worlds.linear("plane")[0], "drawn": lambda: drawn()[0]}[world]()
     one, other = (calibrate(problem, replace(method, engine=engine), prior=prior) for engine in ("dense", "cholmod"))
     a, b = (tree["calibration"].to_dataset() for tree, _ in (one, other))
     assert one[0].attrs["status"] == other[0].attrs["status"] == "converged"
@@ -453,7 +454,7 @@ def test_a_sparse_fit_is_assessed_as_a_dense_one(dense):
     np.testing.assert_allclose(b["shift"][again], a["shift"][again], rtol=0.05, atol=0.01 * np.abs(a["shift"]).max())
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_levels_of_a_sound_network_are_found_right_by_one_look():
     """Near those that the dense form expands; of a std declared half what hangs on it is, and found as there."""
     places = [(0.0, 0.0), (400.0, 0.0), (0.0, 400.0), (400.0, 400.0)]
@@ -581,14 +582,13 @@ def test_what_all_sensors_share_is_open_in_both_forms():
 
 @pytest.mark.ci
 def test_a_network_that_ran_along_what_no_row_tells_is_no_answer():
-    """All rows a mile off to one side: translated in both forms, and invalid in both."""
+    """All rows a mile off to one side: translated, and invalid."""
     network, table = unanchored()
     motion = pc.Target(pc.ConstantVelocity(1.0), start={"position": ((-150.0, 120.0), 1.0)})
     problem = pc.Problem(network, motion, table)
-    for form in ("dense", "cholmod"):
-        tree = pc.fit(problem, pc.MAP(engine=form), prior=pc.Gaussian())
-        assert tree.attrs["status"] == "along a gauge", form
-        assert "along translation of all nodes along x, which no row fixes: it is invalid" in tree.attrs["message"]
+    tree = pc.fit(problem, pc.MAP(engine="cholmod"), prior=pc.Gaussian())
+    assert tree.attrs["status"] == "along a gauge"
+    assert "along translation of all nodes along x, which no row fixes: it is invalid" in tree.attrs["message"]
 
 
 @pytest.mark.ci
@@ -734,7 +734,7 @@ def forced(request, monkeypatch):
 @pytest.mark.parametrize("library", LIBRARIES, indirect=True)
 def test_tracks_under_heavy_tails_are_those_of_the_dense_engine(library, monkeypatch):
     """Latent scales that follow from a calibration, and the tracks, to 1e-3 of their sds."""
-    problem, fit = loud(), pc.fit(loud(), pc.MAP(engine="dense"), prior=pc.Gaussian())
+    problem, (fit, _) = loud(), calibrate(loud(), pc.MAP(tolerance=1e-3, engine="dense"), prior=pc.Gaussian())
     wanted = pc.track(problem, fit)["track/t"].to_dataset()
     for name in ("choose", "room"):
         monkeypatch.setattr(f"probcal.gaussian.{name}.ROOM", 0)
@@ -779,9 +779,10 @@ def test_every_verb_and_method_runs_on_every_engine_or_says_why_not(name, forced
 @pytest.mark.ci
 @pytest.mark.parametrize("step", [pc.EM(pc.Unscented()), pc.EMEA()], ids=lambda own: own.name)
 def test_em_on_any_engine_is_that_of_the_dense_one(step):
-    problem, start = engines.world().problem, engines.world().start
+    problem = worlds.small()
+    start = float64(automatic_start)(problem)
     engined = (replace(step, iterations=20, engine=name) for name in ("dense", "superlu"))
-    one, other = (pc.fit(problem, own, start=start)["calibration"] for own in engined)
+    one, other = (calibrate(problem, own, start=start)[0]["calibration"] for own in engined)
     for name in ("mean", "sd", "gamma", "precision"):
         np.testing.assert_allclose(other[name], one[name], rtol=1e-9)
 

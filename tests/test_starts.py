@@ -135,8 +135,10 @@ def off_by(problem, truth, point):
     return max(places, default=0.0), max(turns)
 
 
-@pytest.mark.ci
-@pytest.mark.parametrize("space", [False, True], ids=["plane", "space"])
+@pytest.mark.parametrize(
+    "space", [pytest.param(False, marks=pytest.mark.ci), pytest.param(True, marks=pytest.mark.slow)],
+    ids=["plane", "space"],
+)  # fmt: skip
 @float64
 def test_an_array_of_which_nothing_is_known_starts_right(space):
     """The five sensors of the DOA paper, headings drawn from all around, places unknown: 3 runs each."""

@@ -90,10 +90,10 @@ def test_c1_at_one_share_reproduces_the_trial_and_equals_single_fits():
 
 @pytest.mark.ci
 def test_each_fit_of_a_study_is_that_of_fit_alone():
-    """Of run 7 a bias lies beyond ten scales on the way and comes back; of runs 0 and 8 maximum likelihood diverges."""
-    methods = {"ml": (MAP(), Flat()), "map": MAP(), "ea-printed": EA.as_printed()}
-    found = study(radars.setting, {"scenario": ["C2"]}, methods, runs=[0, 7, 8]).sel(scenario="C2")
-    assert found["status"].sel(estimator="ml").values.tolist() == ["diverged", "converged", "diverged"]
+    """Of run 7 a bias lies beyond ten scales on the way and comes back; of run 8 maximum likelihood diverges."""
+    methods = {"ml": (MAP(), Flat()), "ea-printed": EA.as_printed()}
+    found = study(radars.setting, {"scenario": ["C2"]}, methods, runs=[7, 8]).sel(scenario="C2")
+    assert found["status"].sel(estimator="ml").values.tolist() == ["converged", "diverged"]
     for run in found["run"].values:
         problem, _ = radars.setting(run, scenario="C2")
         for name, value in methods.items():
@@ -115,14 +115,14 @@ def test_runs_that_survey_other_nodes_keep_their_own_priors():
         return problem, truth
 
     both, alone, other = (
-        study(partial(setting, own=own), {}, {"ea": EA()}, runs=runs)["sd"].sel(run=1)
+        study(partial(setting, own=own), {}, {"ea": EA(precisions="maximised")}, runs=runs)["sd"].sel(run=1)
         for own, runs in ((True, [0, 1]), (True, [1]), (False, [1]))
     )
     np.testing.assert_array_equal(both, alone)
     assert (both != other).all()
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_study_whose_fits_are_more_than_one_climb_runs_them_as_fit_does():
     @probcal.sensor(range=probcal.Channel("m", std=1.0))
     def anchor(target, pose, *, offset=probcal.Bias("m", 6.0, shared="type")):
@@ -135,7 +135,7 @@ def test_a_study_whose_fits_are_more_than_one_climb_runs_them_as_fit_does():
     motion = probcal.Target(probcal.Static(), {"position": ((15.0, 12.0), 10.0)})
     problem, truth = probcal.Problem(network, motion, table), probcal.Truth(biases={"anchor.offset": 0.0})
     found = study(lambda run, k: (problem, truth), {"k": [0]}, {"map": MAP()}, runs=1).isel(k=0, run=0, estimator=0)
-    tree = probcal.fit(problem, MAP())
+    tree, _ = calibrate(problem, MAP())
     mean = tree["calibration"]["mean"].values / problem.scales
     np.testing.assert_allclose(found["error"].values, mean, atol=1e-6)
     assert tree.attrs["places"] == "integrated"

@@ -19,8 +19,6 @@ from terminal import call
 import probcal as pc
 from probcal.plots import plot_history
 
-pytestmark = pytest.mark.ci
-
 MODEL = """
 from probcal import Bias, Channel, ConstantVelocity, Network, Node, Problem, Target, sensor
 
@@ -70,6 +68,7 @@ def last(folder):
     return history[history["time"] == history["time"].max()].drop_duplicates("bias", keep="last").set_index("bias")
 
 
+@pytest.mark.ci
 def test_a_file_is_watched_to_its_end(model, table, tmp_path):
     out = tmp_path / "out"
     code, printed, _ = call("watch", model, table, "--out", out, "--keep", "tracks,rows", "--lag", "8")
@@ -93,6 +92,7 @@ def test_a_file_is_watched_to_its_end(model, table, tmp_path):
     assert "is shorter than what was read of it; it is another file: give another --out" in said
 
 
+@pytest.mark.ci
 def test_a_file_that_grows_is_read_on(model, table, tmp_path):
     whole, pieces, text = tmp_path / "whole", tmp_path / "pieces", lines()
     assert call("watch", model, table, "--out", whole, "--lag", "0")[0] == 0
@@ -103,6 +103,7 @@ def test_a_file_that_grows_is_read_on(model, table, tmp_path):
     np.testing.assert_allclose(one["sd"], other["sd"], rtol=1e-2)
 
 
+@pytest.mark.ci
 def test_a_scan_in_two_blocks_is_one_state_of_its_target(model, table, tmp_path, monkeypatch):
     out = tmp_path / "out"
     monkeypatch.setattr("probcal.stream.watch.BLOCK", 53)
@@ -115,6 +116,7 @@ def test_a_scan_in_two_blocks_is_one_state_of_its_target(model, table, tmp_path,
     np.testing.assert_allclose(tracks["position_x"], whole["position_x"], atol=1e-9)
 
 
+@pytest.mark.ci
 def test_lines_are_counted_on_after_a_restart(model, table, tmp_path):
     text, out = lines(), tmp_path / "out"
     table.write_text("".join(text[:21]))
@@ -129,6 +131,7 @@ def test_lines_are_counted_on_after_a_restart(model, table, tmp_path):
     )
 
 
+@pytest.mark.ci
 def test_particles_go_on_where_they_were(model, table, tmp_path):
     text, options = lines(), ("--particles", "200", "--keep", "rows")
     assert call("watch", model, table, "--out", tmp_path / "whole", *options)[0] == 0
@@ -146,6 +149,7 @@ def test_particles_go_on_where_they_were(model, table, tmp_path):
     assert "--particles filters without --lag; give one of the two" in said
 
 
+@pytest.mark.slow
 @pytest.mark.needs("roads")
 def test_who_is_on_a_road_is_filtered_and_who_cannot_be_sure_is_told(model, table, tmp_path):
     model.write_text(ON_ROAD)
@@ -160,6 +164,7 @@ def test_who_is_on_a_road_is_filtered_and_who_cannot_be_sure_is_told(model, tabl
     assert "Intervals may be too narrow." in pc.load(out).attrs["message"]
 
 
+@pytest.mark.ci
 def test_rows_at_which_a_watch_is_told_to_end_are_taken_whole(model, table, tmp_path, monkeypatch):
     out, update = tmp_path / "out", pc.Online.update
 
@@ -181,6 +186,7 @@ def test_rows_at_which_a_watch_is_told_to_end_are_taken_whole(model, table, tmp_
     assert (out / "rows.csv").read_text() == table.read_text()
 
 
+@pytest.mark.ci
 def test_standard_input_is_watched(model, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO("".join(lines()).encode())))
     code, printed, _ = call("watch", model, "--lag", "0")
@@ -189,6 +195,7 @@ def test_standard_input_is_watched(model, monkeypatch):
     assert "80 rows up to time 39 s" in printed
 
 
+@pytest.mark.ci
 def test_rows_that_cannot_be_taken_are_put_aside(model, table, tmp_path):
     text, out = lines(), tmp_path / "out"
     bad = [*text[:20], "9,n7,1.0,2.0\n", *text[20:30], "nonsense,n1,1.0,2.0\n", *text[30:], text[-1]]
@@ -201,6 +208,7 @@ def test_rows_that_cannot_be_taken_are_put_aside(model, table, tmp_path):
     assert "1 duplicates, 2 left out (see refused.csv)" in printed
 
 
+@pytest.mark.ci
 def test_a_row_that_cannot_be_meant_is_put_aside_wherever_it_stands(model, table, tmp_path):
     model.write_text(MODEL.replace("std=1.0)", "std=1.0, noise=StudentT(4.0))").replace("Target,", "StudentT, Target,"))
     text = lines()
@@ -218,6 +226,7 @@ def test_a_row_that_cannot_be_meant_is_put_aside_wherever_it_stands(model, table
     assert pc.load(tmp_path / "out").attrs["stream_refused"] == 3
 
 
+@pytest.mark.ci
 def test_a_first_table_of_nonsense_ends_in_one_sentence(model, table, tmp_path):
     text = lines()
     (tmp_path / "own.csv").write_text("".join(text))
@@ -230,6 +239,7 @@ def test_a_first_table_of_nonsense_ends_in_one_sentence(model, table, tmp_path):
     assert "looks like ms since 1970; write the header as time [ms]" in said.replace("\n", " ")
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("since", [None, "2026-05-01T00:00:00Z"], ids=["seconds", "dates"])
 def test_rows_of_the_calibration_are_not_counted_again(model, table, tmp_path, since, monkeypatch):
     monkeypatch.setattr("probcal.stream.online.RECENT", 10)
@@ -251,6 +261,7 @@ def test_rows_of_the_calibration_are_not_counted_again(model, table, tmp_path, s
     assert pd.read_csv(tmp_path / "two" / "refused.csv")["line"].tolist() == list(range(2, 62))
 
 
+@pytest.mark.ci
 def test_rows_are_filtered_at_common_epochs(model, table):
     model.write_text(MODEL.replace("motion, data)", "motion, data, epoch=2.0)"))
     code, printed, _ = call("watch", model, table, "--lag", "8")
@@ -258,6 +269,7 @@ def test_rows_are_filtered_at_common_epochs(model, table):
     assert "80 rows up to time 40 s" in printed
 
 
+@pytest.mark.ci
 @pytest.mark.needs("roads")
 def test_what_is_wrong_is_said(model, table, tmp_path):
     wrong = {
@@ -299,6 +311,7 @@ def edited(text):
     return text.replace(",n0,", ",n1,", 1)
 
 
+@pytest.mark.ci
 def test_a_stream_goes_on_in_the_file_that_it_began_in(model, table, tmp_path):
     out, text = tmp_path / "out", "".join(lines())
     options = ("watch", model, table, "--out", out, "--lag", "0")
@@ -318,6 +331,7 @@ def test_a_stream_goes_on_in_the_file_that_it_began_in(model, table, tmp_path):
     assert call(*options)[0] == 0
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 def test_a_last_line_without_an_end_is_taken_once(end, model, table, tmp_path):
     out, text = tmp_path / "out", lines()
@@ -335,6 +349,7 @@ def test_a_last_line_without_an_end_is_taken_once(end, model, table, tmp_path):
     assert pd.read_csv(out / "refused.csv")["line"].tolist() == [82]
 
 
+@pytest.mark.ci
 def test_a_state_of_another_model_is_refused(model, table, tmp_path):
     out = tmp_path / "out"
     options = ("watch", model, table, "--out", out, "--lag", "0")
@@ -366,6 +381,7 @@ def place(model):
     return found["problem"](pd.DataFrame({"time": [0.0], "sensor": ["n0"], "east": [1.0], "north": [1.0]}))
 
 
+@pytest.mark.ci
 def test_a_damaged_state_or_table_is_one_sentence(model, table, tmp_path):
     out = tmp_path / "out"
     options = ("watch", model, table, "--out", out, "--lag", "0")
@@ -387,6 +403,7 @@ def test_a_damaged_state_or_table_is_one_sentence(model, table, tmp_path):
     assert call(*options)[0] == 0
 
 
+@pytest.mark.ci
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits of files")
 def test_a_full_disk_is_one_sentence_and_the_state_stays_whole(model, table, tmp_path, monkeypatch):
     """Files of a process may have this many bytes: what is too long for one is written to its limit, then fails."""
@@ -415,6 +432,7 @@ def test_a_full_disk_is_one_sentence_and_the_state_stays_whole(model, table, tmp
     pd.testing.assert_frame_equal(last(out), last(tmp_path / "whole"))
 
 
+@pytest.mark.ci
 def test_progress_of_a_file_has_rows_rate_and_share(model, table, monkeypatch):
     @contextmanager
     def shown():
@@ -477,6 +495,7 @@ def test_a_killed_watch_goes_on_and_counts_every_row_once(model, table, tmp_path
     np.testing.assert_allclose(last(out)["mean"], last(tmp_path / "whole")["mean"], atol=0.02)
 
 
+@pytest.mark.ci
 def test_a_history_is_drawn_with_its_jumps():
     times = np.arange(5.0)
     row = {"unit": "rad", "sd": 0.1, "lower": 0.0, "upper": 0.2}
