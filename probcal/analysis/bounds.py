@@ -15,7 +15,7 @@ import xarray as xr
 
 from probcal import linalg
 from probcal.analysis.standpoint import draw_states, on_tracks_of, true_biases, true_point
-from probcal.errors import InputError, nearest
+from probcal.errors import InputError, check_known
 from probcal.gaussian.choose import choose
 from probcal.gaussian.engine import Expansion, Factors, told_alone
 from probcal.gaussian.mode import Point
@@ -61,8 +61,7 @@ def bounds(
     >>> bounds(problem)["bias"]["sd"].sizes["bias_label"]
     12
     """
-    if kind not in KINDS:
-        raise InputError(f'bounds: kind is "{kind}"{nearest(kind, KINDS)}')
+    check_known(kind, KINDS, f'bounds: kind is "{kind}"')
     if draws < 1:
         raise InputError(f"bounds: draws={draws}; take at least one")
     given = Truth() if truth is None else truth
@@ -79,7 +78,17 @@ def bounds(
     alone = told_alone(at) + prior
     information = at.information()
     if information is None:
-        variance, bounded, spread = _by_ridge(at, prior, alone)
+        # variance (M,) of the biases, who is bounded (M,), and variances (E, n) of the states
+        ridge = LOST * np.where(alone > 0, alone, 1.0) * (prior == 0)
+        try:
+            found = at.spread(Factors.alone(prior + ridge))
+            loose = at.spread(Factors.alone(prior + 10.0 * ridge)) if ridge.any() else found
+        except np.linalg.LinAlgError:
+            raise InputError(
+                "bounds: rounding hides which biases of so many have none; survey or fix some of those that"
+                ' observability names, or take kind="posterior"'
+            ) from None
+        variance, bounded, spread = found.biases, found.biases < FOLLOWS * loose.biases, found.states
         return _tree(problem, kind, len(z), np.sqrt(variance), None, bounded, spread)
     root, bounded = _bounded_root(information + np.diag(prior), alone)
     covariance = root @ root.T
@@ -119,29 +128,9 @@ def _rooted(information: jax.Array, used: int) -> Linearised:
     """Data of weight one that have the information (N, v, v), about `used` states and then biases."""
     size = jnp.sqrt(jnp.diagonal(information, axis1=1, axis2=2))
     size = jnp.where(size == 0, 1.0, size)
-    values, vectors = linalg.spectrum(information / (size[:, :, None] * size[:, None, :]))
+    values, vectors = linalg.spectrum(information / linalg.outer(size))
     root = jnp.sqrt(jnp.maximum(values, 0.0))[:, :, None] * vectors.mT * size[:, None, :]
     return Linearised(jnp.zeros_like(size), jnp.ones_like(size), root[:, :, :used], root[:, :, used:])
-
-
-def _by_ridge(
-    at: Expansion, prior: np.ndarray, alone: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
-    """Variance (M,) of the biases, who is bounded (M,), and variances (E, n) of the states.
-
-    A share `LOST` of the information `alone` (M,) is added where there is no prior. A bias whose variance follows when
-    ten times that is added has no bound.
-    """
-    ridge = LOST * np.where(alone > 0, alone, 1.0) * (prior == 0)
-    try:
-        found = at.spread(Factors.alone(prior + ridge))
-        loose = at.spread(Factors.alone(prior + 10.0 * ridge)) if ridge.any() else found
-    except np.linalg.LinAlgError:
-        raise InputError(
-            "bounds: rounding hides which biases of so many have none; survey or fix some of those that"
-            ' observability names, or take kind="posterior"'
-        ) from None
-    return found.biases, found.biases < FOLLOWS * loose.biases, found.states
 
 
 def _bounded_root(information: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -118,10 +118,5 @@ def draws_of(fit: Judged, tree: xr.DataTree, key: jax.Array) -> FitDraws:
     replicas = tree["posterior_predictive"].to_dataset()["y"] if "posterior_predictive" in tree.children else None
     if replicas is None or replicas.sizes["draw"] < posterior.sizes["draw"]:
         return FitDraws(z, levels, states, None)
-    flat, blocks, start = thin(replicas.values), [], 0
-    for there, (row, channel) in zip(problem.model.measured, fit.picks, strict=True):
-        block = np.zeros((most, *there.shape))
-        block[:, row, channel] = flat[:, start : start + len(row)]
-        blocks.append(jnp.asarray(block))
-        start += len(row)
-    return FitDraws(z, levels, states, blocks)
+    blocks = fit.in_blocks(thin(replicas.values).T)
+    return FitDraws(z, levels, states, [jnp.moveaxis(own, -1, 0) for own in blocks])

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.errors import InputError, nearest
+from probcal.errors import InputError, check_known
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.choose import choose
 from probcal.gaussian.mode import Point, factors
@@ -39,10 +39,7 @@ def standpoint(problem: Problem, point: Point | None, truth: Truth | None) -> Po
 def true_biases(problem: Problem, truth: Truth) -> jax.Array:
     """True biases z (M,), 0 where the truth is silent."""
     for label in truth.biases:
-        if label not in problem.network.labels:
-            raise InputError(
-                f'the truth names the bias "{label}", which the network lacks{nearest(label, problem.network.labels)}'
-            )
+        check_known(label, problem.network.labels, f'the truth names the bias "{label}", which the network lacks')
     return jnp.asarray([truth.biases.get(b.label, 0.0) / b.scale for b in problem.biases], float)
 
 

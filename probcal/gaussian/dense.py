@@ -14,7 +14,6 @@ from probcal.gaussian.draws import draw_trajectories
 from probcal.gaussian.engine import Engine, Estimate, Factors, Sampled, Spread, density_of
 from probcal.gaussian.linearised import (
     Trajectory,
-    compress_and_eliminate,
     leverages,
     linearise_rows,
     marginal_variances,
@@ -22,7 +21,7 @@ from probcal.gaussian.linearised import (
     trajectories_of,
 )
 from probcal.gaussian.marginal import volume_slope
-from probcal.gaussian.mode import Compressed, Eliminated, Point, follow
+from probcal.gaussian.mode import Eliminated, Point, eliminate_rows, follow
 from probcal.gaussian.solves import Dense
 from probcal.linalg import without_negative
 from probcal.model.model import Data, Model
@@ -34,13 +33,13 @@ from probcal.simulate import derived_keys
 class DenseEngine(Engine):
     """Matrices of all biases: the fastest where they fit."""
 
-    cheap: ClassVar[bool] = True
+    cheap = True
     exact: ClassVar[bool] = True
 
     def at(self, model: Model, point: Point, rows: tuple[Linearised, ...] | None = None) -> DenseExpansion:
         """The posterior at a consistent point; rows as the caller linearised them."""
         rows = linearise_rows(model, point) if rows is None else tuple(rows)
-        return DenseExpansion(model, point, rows, *compress_and_eliminate(model, point, rows))
+        return DenseExpansion(model, point, rows, eliminate_rows(model, point, rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +49,6 @@ class DenseExpansion:
     model: Model
     point: Point
     rows: tuple[Linearised, ...]
-    system: Compressed
     eliminated: Eliminated
     _kept: list[Any] = field(default_factory=list)  # the factors asked for last, precision and covariance
 

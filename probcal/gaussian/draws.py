@@ -66,7 +66,7 @@ def draw(
         seeds = derived_keys(key, (2 * k, 2 * k + 1))
         mine = jax.device_put(biases[chosen])
         states = draw_trajectories(at, mine, seeds[0])
-        by_datum: tuple[Data, Data] = ((), ())
+        by_datum = ((), ())
         if {"log_likelihood", "replicas"} & set(keep):
             told, again = predictive(at.model, log_levels[chosen], mine, states, seeds[1], keep)
             by_datum = tuple(part.sum((1, 2), keepdims=True) for part in told) if large else told, again

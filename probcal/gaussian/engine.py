@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from probcal.gaussian.mode import (
@@ -254,13 +255,15 @@ def noise_score(at: Expansion, factors: Factors) -> tuple[Data, tuple[jax.Array,
 
     Of every datum (N, C) of each block, and of every whitened noise (E, n) of each recursion.
     """
+    return noise_terms(at, factors)[0]
+
+
+def noise_terms(at: Expansion, factors: Factors) -> list[tuple[Data, tuple[jax.Array, ...]]]:
+    """`noise_score`, and the same of the information about log noise levels.
+
+    That is a lower bound: it lacks what noises that hang together add.
+    """
     return _noise_terms(at.model, at.point, tuple(at.predicted(factors)), tuple(at.noises(factors)))
-
-
-def noise_information(at: Expansion, factors: Factors) -> tuple[Data, tuple[jax.Array, ...]]:
-    """The same of the information about log noise levels, less what noises that hang together add:
-    a lower bound."""
-    return _noise_information(at.model, at.point, tuple(at.predicted(factors)), tuple(at.noises(factors)))
 
 
 def density_of(model: Model, point: Point, volume: jax.Array) -> float:
@@ -273,16 +276,10 @@ def density_of(model: Model, point: Point, volume: jax.Array) -> float:
 @jax.jit
 def _noise_terms(
     model: Model, point: Point, spread: Data, driven: tuple[jax.Array, ...]
-) -> tuple[Data, tuple[jax.Array, ...]]:
-    parts = (model.level_score(point), model.information(point), spread, model.measured)
-    rows = jax.tree.map(lambda score, weight, own, there: score + weight * own - there, *parts)
-    return rows, jax.tree.map(lambda u, variance: u**2 + variance - 1.0, tuple(point.noises), driven)
-
-
-@jax.jit
-def _noise_information(
-    model: Model, point: Point, spread: Data, driven: tuple[jax.Array, ...]
-) -> tuple[Data, tuple[jax.Array, ...]]:
-    parts = (model.information(point), spread, model.measured)
-    rows = jax.tree.map(lambda weight, own, there: 2.0 * there * (1.0 - weight * own) ** 2, *parts)
-    return rows, jax.tree.map(lambda own: 2.0 * (1.0 - own) ** 2, driven)
+) -> list[tuple[Data, tuple[jax.Array, ...]]]:
+    told = jax.tree.map(jnp.multiply, model.information(point), spread)
+    parts = (model.level_score(point), told, model.measured)
+    score = jax.tree.map(lambda score, own, there: score + own - there, *parts)
+    known = jax.tree.map(lambda own, there: 2.0 * there * (1.0 - own) ** 2, told, model.measured)
+    noises = jax.tree.map(lambda u, variance: u**2 + variance - 1.0, tuple(point.noises), driven)
+    return [(score, noises), (known, jax.tree.map(lambda own: 2.0 * (1.0 - own) ** 2, driven))]

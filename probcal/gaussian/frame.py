@@ -173,7 +173,9 @@ def _frame(model: Model, point: Point, lins: Sequence[Linearised]) -> Frame:
     if H:
         values, slopes = _at(model, point, point.levels[None] + _moves(H))
         information, score = _with_levels(information, score, values, slopes, H)
-    by_level = [_share(model, point, lins, h) for h in range(H if model.driven else 0)]
+    by_level = [
+        model.of_states(scaled(lins, [data.level == h for data in model.rows])) for h in range(H if model.driven else 0)
+    ]
     loops = []
     for r, (part, kept) in enumerate(model.each_layout(solved.parts)):
         L, J, pull = factors(part, point.levels), kept.J, kept.pull
@@ -181,18 +183,11 @@ def _frame(model: Model, point: Point, lins: Sequence[Linearised]) -> Frame:
         closed = closed_loop(part, L, J, pull, point.noises[r])
         closed = closed._replace(shift=jnp.zeros_like(pull))  # the point is the mean, by definition
         own = [share[r] for share in by_level]
-        shares = (
-            jnp.stack([J_h for J_h, _ in own]) if own else jnp.zeros((0, *J.shape)),
-            jnp.stack([pull_h for _, pull_h in own]) if own else jnp.zeros((0, *pull.shape)),
-        )
+        none = jnp.zeros((0, *J.shape)), jnp.zeros((0, *pull.shape))
+        shares = jax.tree.map(lambda *each: jnp.stack(each), *own) if own else none
         loops.append(Loop(-smooth.states, -smooth.noises, closed, (J, pull), shares))
     height = log_density(model, point) - 0.5 * solved.logdet
     return Frame(point, information, score, height, tuple(loops))
-
-
-def _share(model: Model, point: Point, lins: Sequence[Linearised], h: int) -> list[tuple[jax.Array, jax.Array]]:
-    """Information and score of the states of each recursion by the data whose noise has unknown level h."""
-    return model.of_states(scaled(lins, [data.level == h for data in model.rows]))
 
 
 def _moves(H: int) -> np.ndarray:
@@ -285,8 +280,8 @@ def unit_normals(model: Model, frame: Frame, point: Point) -> tuple[jax.Array, .
 
     def normals(_: Recursion, loop: Loop, at: Closed, dx: jax.Array, du: jax.Array) -> jax.Array:
         deviations = dx - loop.states @ step
-        before = jnp.concatenate([jnp.zeros_like(dx[:1]), deviations[:-1]])
-        own = du - loop.noises @ step - at.shift + jnp.einsum("eij,ej->ei", at.feedback, before)
+        fed = jnp.einsum("eij,ej->ei", at.feedback, linalg.preceding(deviations))
+        own = du - loop.noises @ step - at.shift + fed
         solved = linalg.solve_batched(at.factor @ at.factor.mT, own)
         return jnp.exp(-at.size) * jnp.einsum("eji,ej->ei", at.factor, solved)
 

@@ -10,6 +10,7 @@ from probcal.gaussian.draws import residuals
 from probcal.gaussian.mode import Point, factors
 from probcal.misfit import Rejected
 from probcal.model.model import Data, Model, Recursion
+from probcal.model.rows import families_at
 from probcal.noise import HALF
 from probcal.problem import Problem
 
@@ -36,10 +37,11 @@ def rejected(problem: Problem, point: Point) -> list[Rejected]:
     owners = [problem.measurements.sensor[index] for index in problem.row_index]
     left, found = residuals(model, point), list[Rejected]()
     counts: dict[tuple[str, float], np.ndarray] = {}  # below half weight, of these not gross, all
-    for b, noises in enumerate(model.noises_at(point.levels)):
+    for b, block in enumerate(model.blocks):
         mask = np.asarray(model.measured[b])
         low = np.asarray(left.reliance[b]) < HALF * mask
         near = np.abs(left.innovation[b]) < GROSS * np.asarray(left.std[b])
+        noises = families_at(block, np.asarray(point.levels))
         for c, (channel, noise) in enumerate(zip(problem.columns[b], noises, strict=True)):
             kinds = (low[:, c], low[:, c] & near[:, c], mask[:, c] > 0)
             each = np.stack([np.bincount(owners[b], kind, len(sensors)) for kind in kinds])

@@ -20,6 +20,7 @@ import numpy as np
 from probcal.gaussian.engine import Factors
 from probcal.gaussian.factor import Entries, leading, mirrored
 from probcal.gaussian.mode import factors, inverse_factors
+from probcal.linalg import outer
 from probcal.model.model import Model
 from probcal.model.rows import Linearised
 
@@ -134,7 +135,7 @@ class JointPrecision:
     def holds(self, members: np.ndarray) -> bool:
         """Whether all pairs of biases (B, p) of a row have a place."""
         there = members < self.places.size - self.states
-        return bool((self.pairs(members) >= 0)[there[:, :, None] & there[:, None, :]].all())
+        return bool((self.pairs(members) >= 0)[outer(there)].all())
 
     def block_values(self, members: np.ndarray, pairs: np.ndarray, inverse: np.ndarray) -> np.ndarray:
         """Covariances (B, p, p) of biases (B, p), of their `pairs` in the inverse at the places of
@@ -256,10 +257,10 @@ def blocks_of(model: Model) -> np.ndarray:
     taken[M] = True
     wide = max((data.bias.shape[1] for data in model.rows), default=1)
     for data in model.rows:
-        own: np.ndarray = np.sort(np.asarray(data.bias), 1)
+        own = np.sort(np.asarray(data.bias), 1)
         own = np.where(np.concatenate([np.zeros((len(own), 1), bool), own[:, 1:] == own[:, :-1]], 1), M, own)
         values, first = np.unique(own, return_index=True)
-        mine: np.ndarray = np.full(own.size, M)
+        mine = np.full(own.size, M)
         mine[first] = np.where(taken[values], M, values)
         taken[values] = True
         room = wide - own.shape[1]

@@ -13,11 +13,9 @@ import jax.numpy as jnp
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.mode import (
-    Compressed,
     Eliminated,
     Point,
-    compress_rows,
-    eliminate_compressed,
+    eliminate,
     factors,
     log_density,
     mixing_gain,
@@ -111,14 +109,7 @@ def given_biases(model: Model, levels: jax.Array, solved: Eliminated) -> tuple[G
 
 def linearise_rows(model: Model, point: Where) -> tuple[Linearised, ...]:
     """All rows linearised at a point with the expected information."""
-    found: tuple[Linearised, ...] = rows_at(model, point, True)
-    return found
-
-
-def compress_and_eliminate(model: Model, point: Point, rows: tuple[Linearised, ...]) -> tuple[Compressed, Eliminated]:
-    """Linearised rows compressed, and the system without its trajectories."""
-    system = compress_rows(model, point.z, rows, True)
-    return system, eliminate_compressed(model, point.noises, point.levels, system)
+    return rows_at(model, point, True)
 
 
 @jax.jit
@@ -141,7 +132,7 @@ def laplace(model: Model, point: Point, prior: Precision) -> LaplaceApproximatio
     A precision of 0 is a flat prior: its density counts as one. The expected information is used throughout. Where
     process noise is not Gaussian it is the variational lower bound of the evidence (see `mixing_gain`).
     """
-    return laplace_of(model, point, compress_and_eliminate(model, point, linearise_rows(model, point))[1], prior)
+    return laplace_of(model, point, eliminate(model, point, expected=True), prior)
 
 
 @jax.jit

@@ -19,7 +19,7 @@ from probcal.gaussian.search import DAMPING, ROUNDING, between, branch, damped_o
 from probcal.gaussian.solves import Dense
 from probcal.linalg import library
 from probcal.model.model import At, Model, Recursion, Tail, Where
-from probcal.model.rows import Linearised
+from probcal.model.rows import Linearised, level_factors
 from probcal.model.trajectories import Trajectories
 from probcal.priors import Precision
 
@@ -93,7 +93,7 @@ class Kept(NamedTuple):
 @partial(jax.jit, inline=True)  # one kernel where it stands alone
 def factors(part: Recursion, levels: jax.Array) -> jax.Array:
     """Noise factors with the estimated levels, and the precisions of noise that is not Gaussian, (E, n, n)."""
-    scale = jnp.concatenate([jnp.exp(levels), jnp.ones(1, levels.dtype)])[part.level]
+    scale = level_factors(levels)[part.level]
     scale = scale / jnp.sqrt(part.weight) if part.tails else scale
     return part.L * scale[:, None, :]
 
@@ -108,7 +108,7 @@ def inverse_factors(part: Recursion, levels: jax.Array) -> jax.Array:
 @partial(jax.jit, inline=True)
 def noises_of(part: Recursion, levels: jax.Array, states: jax.Array) -> jax.Array:
     """The shortest whitened noises (E, n) that drive states (E, n) of one recursion without drift."""
-    before = jnp.concatenate([jnp.zeros_like(states[:1]), states[:-1]])
+    before = linalg.preceding(states)
     left = states - jnp.einsum("eij,ej->ei", part.F, before)
     return jnp.einsum("eij,ej->ei", inverse_factors(part, levels), left)
 
@@ -140,13 +140,6 @@ def log_density(model: Model, point: Point) -> jax.Array:
 def _tilt(model: Model, point: Where) -> Any:
     """The log density of integrated places at a point."""
     return np.zeros(()) if model.tilt is None else model.tilt.value(point.z)
-
-
-def track_costs(model: Model, point: Point) -> jax.Array:
-    """Negative log density (T,) of the data and the whitened noises of each target."""
-    sums = model.by_epoch(model.log_likelihood(point))
-    own = model.each(lambda _, own, u: 0.5 * jnp.sum(u**2, 1) - own, sums, point.noises)
-    return jnp.concatenate(model.by_target(own))
 
 
 def mixed_density(model: Model, point: Point) -> jax.Array:
@@ -357,7 +350,10 @@ def part_way(model: Model, point: Point, full: Point, shares: jax.Array) -> tupl
     by_epoch = model.each(lambda part, share: share[part.target][:, None], own)
     most = jnp.max(shares, initial=0.0)
     found = jax.tree.map(between, point, full, Point(by_epoch, by_epoch, most, most))
-    return track_costs(model, found), found
+    # negative log density (T,) of the data and the whitened noises of each target
+    sums = model.by_epoch(model.log_likelihood(found))
+    costs = model.each(lambda _, own, u: 0.5 * jnp.sum(u**2, 1) - own, sums, found.noises)
+    return jnp.concatenate(model.by_target(costs)), found
 
 
 def shortened(

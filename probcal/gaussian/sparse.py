@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,7 @@ class SparseEngine(Engine):
     # of the last form of a model
     _patterns: list[tuple[list[Any], JointPrecision]] = field(default_factory=list, compare=False)
 
-    cheap: ClassVar[bool] = False
+    cheap = False
 
     @property
     def exact(self) -> bool:

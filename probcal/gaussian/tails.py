@@ -79,23 +79,19 @@ def settle(engine: Engine, problem: Problem, point: Point, root: Any) -> tuple[P
     root root', root (M, R)."""
     for _ in range(ROUNDS if problem.model.tailed else 0):
         at = engine.settled(problem.model, point)
-        point, weights = at.point, expected_mixing(problem.model, at.point, driven_by(at, root))
+        # variance (E, n) of every whitened noise, biases of the covariance root root', root (M, R)
+        gains = tuple(kept.gain for kept in at.eliminated.parts)
+        found = tuple(own.spread for own in at.given_biases())
+        for start in range(0, root.shape[1], COLUMNS):
+            own = root[:, start : start + COLUMNS]
+            found = _driven(at.model, at.rows, gains, found, own @ np.eye(own.shape[1]))
+        point, weights = at.point, expected_mixing(problem.model, at.point, found)
         pairs = zip(jax.tree.leaves(problem.model.mixing), jax.tree.leaves(weights), strict=True)
         moved = max(float(np.abs(np.log(np.asarray(b) / np.asarray(a))).max(initial=0.0)) for a, b in pairs)
         point, problem = rewhitened(problem.model, point, weights), problem.with_mixing(weights)
         if moved < STILL:
             break
     return problem, point
-
-
-def driven_by(at: Expansion, root: Any) -> tuple[jax.Array, ...]:
-    """Variance (E, n) of every whitened noise, biases of the covariance root root', root (M, R)."""
-    gains = tuple(kept.gain for kept in at.eliminated.parts)
-    found = tuple(own.spread for own in at.given_biases())
-    for start in range(0, root.shape[1], COLUMNS):
-        own = root[:, start : start + COLUMNS]
-        found = _driven(at.model, at.rows, gains, found, own @ np.eye(own.shape[1]))
-    return found
 
 
 @jax.jit

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 
 from probcal.devices import over_devices
 from probcal.gaussian.frame import place
-from probcal.gaussian.search import zeros_from
+from probcal.gaussian.search import chosen, zeros_from
+from probcal.inference.draws import accepted
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, conditional, log_prior
 from probcal.inference.sides import Sided, shifted, side_of
@@ -88,9 +89,8 @@ def run_sided(method: Any, form: Form, sides: Posed, state: Sided, thin: jax.Arr
             pick, lot = jax.random.split(own)
             other = (side + 1 + jax.random.randint(pick, (), 0, count - 1)) % count
             moved, gain = way(side_of(sides, side), side_of(sides, other), chain)
-            taken = jnp.log(jax.random.uniform(lot)) < jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
-            pairs = ((moved, other), (chain, side))
-            chain, side = jax.tree.map(lambda new, old, taken=taken: jnp.where(taken, new, old), *pairs)
+            taken = accepted(lot, gain)
+            chain, side = chosen(taken, (moved, other), (chain, side))
             crossed = crossed | taken
         stats = sample.stats | {"side": state.side, "crossed": crossed}
         return Sided(chain, side, key), sample._replace(stats=stats)

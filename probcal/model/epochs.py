@@ -250,12 +250,7 @@ def _mean(states: jax.Array, move: Move, target: jax.Array) -> jax.Array:
 
 
 def _root(move: Move, levels: jax.Array) -> jax.Array:
-    return move.L * jnp.concatenate([jnp.exp(levels), jnp.ones(1, levels.dtype)])[move.level][None, :]
-
-
-def most_rows(model: Any) -> tuple[int, ...]:
-    """The most rows that an epoch has, of each block."""
-    return tuple(int(np.bincount(np.asarray(data.epoch)).max(initial=0)) for data in model.rows)
+    return move.L * waist.level_factors(levels)[move.level][None, :]
 
 
 def merged(model: Any, fill: tuple[Rows, ...], sizes: tuple[int, ...]) -> Epoch:

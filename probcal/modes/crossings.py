@@ -146,7 +146,7 @@ class _Own:
         node[own] = np.arange(len(own))[:, None]
         node[-1] = -1
         each = [node[np.asarray(read)].max(1, initial=-1) for read in model.read]  # the node of each row, -1 of none
-        information: np.ndarray = np.eye(own.shape[1])
+        information = np.eye(own.shape[1])
         for _ in range(STEPS):
             information, pull = np.tile(np.eye(own.shape[1]), (len(own), 1, 1)), -after[own]
             linearised = _linearised(model, point, jax.device_put(after[:-1]))
