@@ -22,7 +22,8 @@ from probcal.gaussian.mode import Point
 from probcal.labels import NOBODY, listed
 from probcal.linalg import spectrum
 from probcal.model.model import At, Model
-from probcal.model.rows import Linearised
+from probcal.model.rows import Linearised, LinearRows
+from probcal.model.trajectories import States
 from probcal.problem import Problem
 from probcal.results.groups import along, bias_coords, by_target, node_of
 from probcal.simulate import Key, Truth, as_key
@@ -95,7 +96,7 @@ def bounds(
     return _tree(problem, kind, len(z), np.sqrt(np.diagonal(covariance)), covariance, bounded, at.followed(root))
 
 
-def _averaged(model: Model, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...]) -> Expansion:
+def _averaged(model: Model, levels: jax.Array, z: jax.Array, states: States) -> Expansion:
     """The information of all rows, averaged over points z (D, M) and states (D, E, n), and the trajectories."""
     rows = _average(model, levels, z, states)
     if not all(bool(np.isfinite(leaf).all()) for leaf in jax.tree.leaves(rows)):
@@ -105,18 +106,18 @@ def _averaged(model: Model, levels: jax.Array, z: jax.Array, states: tuple[jax.A
 
 
 @jax.jit
-def _average(model: Model, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...]) -> tuple[Linearised, ...]:
+def _average(model: Model, levels: jax.Array, z: jax.Array, states: States) -> LinearRows:
     """Rows of the expected information, averaged over points z (D, M) and states (D, E, n), without scores.
 
     The average of H'WH of a row is the information of as many data as the row reads states and biases.
     """
 
-    def at(z_d: jax.Array, states_d: tuple[jax.Array, ...]) -> list[jax.Array]:
+    def at(z_d: jax.Array, states_d: States) -> list[jax.Array]:
         lins = model.linearise(At(states_d, z_d, levels), expected=True)
         both = [(jnp.concatenate([lin.state, lin.bias], 2), lin.weight) for lin in lins]
         return [jnp.einsum("ncv,nc,ncw->nvw", H, weight, H) for H, weight in both]
 
-    def add(total: list[jax.Array], point: tuple[jax.Array, tuple[jax.Array, ...]]) -> tuple[list[jax.Array], None]:
+    def add(total: list[jax.Array], point: tuple[jax.Array, States]) -> tuple[list[jax.Array], None]:
         return jax.tree.map(jnp.add, total, at(*point)), None
 
     shapes = jax.eval_shape(at, z[0], tuple(x[0] for x in states))

@@ -16,9 +16,10 @@ import xarray as xr
 from probcal.gaussian.draws import draw
 from probcal.inference.fitted import Judged
 from probcal.inference.residuals import all_gaussian, exact_kurtosis
-from probcal.model.model import At, Model
+from probcal.model.model import At, Data, Model
 from probcal.model.motions import level_logs
 from probcal.model.rows import standardised
+from probcal.model.trajectories import States
 from probcal.results.read import each_track, saved_states
 
 DRAWS = 400
@@ -31,7 +32,7 @@ class FitDraws(NamedTuple):
 
     z: jax.Array
     levels: jax.Array
-    states: tuple[jax.Array, ...]
+    states: States
     replicas: Sequence[jax.Array] | None
 
 
@@ -49,7 +50,7 @@ class Predictive(NamedTuple):
 
 @partial(jax.jit, static_argnames="count")
 def _discrepancies(
-    model: Model, levels: jax.Array, drawn: FitDraws, sensors: tuple[jax.Array, ...], count: int,
+    model: Model, levels: jax.Array, drawn: FitDraws, sensors: Data, count: int,
     key: jax.Array,
 ) -> tuple[list[jax.Array], list[jax.Array]]:  # fmt: skip
     """By draw, data or replica, sensor and channel (D, 2, 2, S, C): -log p and sum of scores; fourth powers (N, C)."""

@@ -15,6 +15,7 @@ from probcal.gaussian.choose import choose
 from probcal.gaussian.mode import Point, smooth_tracks
 from probcal.geometry import lattice
 from probcal.model.model import At, Model
+from probcal.model.trajectories import States
 from probcal.modes.grid import follow_states
 from probcal.problem import Problem
 from probcal.simulate import Key, Truth, as_key
@@ -108,7 +109,7 @@ def _errors(
     spans: Spans,
     spread: jax.Array,
     unit: jax.Array,
-    true: tuple[jax.Array, ...],
+    true: States,
     start: Point,
     keys: jax.Array,
 ) -> jax.Array:

@@ -25,7 +25,8 @@ from probcal.gaussian.mode import Eliminated, Point, eliminate_rows, follow
 from probcal.gaussian.solves import Dense
 from probcal.linalg import without_negative
 from probcal.model.model import Data, Model
-from probcal.model.rows import Linearised
+from probcal.model.rows import LinearRows
+from probcal.model.trajectories import States
 from probcal.simulate import derived_keys
 
 
@@ -36,7 +37,7 @@ class DenseEngine(Engine):
     cheap = True
     exact: ClassVar[bool] = True
 
-    def at(self, model: Model, point: Point, rows: tuple[Linearised, ...] | None = None) -> DenseExpansion:
+    def at(self, model: Model, point: Point, rows: LinearRows | None = None) -> DenseExpansion:
         """The posterior at a consistent point; rows as the caller linearised them."""
         rows = linearise_rows(model, point) if rows is None else tuple(rows)
         return DenseExpansion(model, point, rows, eliminate_rows(model, point, rows))
@@ -48,7 +49,7 @@ class DenseExpansion:
 
     model: Model
     point: Point
-    rows: tuple[Linearised, ...]
+    rows: LinearRows
     eliminated: Eliminated
     _kept: list[Any] = field(default_factory=list)  # the factors asked for last, precision and covariance
 
@@ -62,7 +63,7 @@ class DenseExpansion:
         return self.trajectories
 
     @property
-    def held_states(self) -> tuple[jax.Array, ...]:
+    def held_states(self) -> States:
         """Covariance (E, n, n) of every state of each recursion, the biases known."""
         return tuple(own.covariance for own in self.trajectories)
 
@@ -143,11 +144,11 @@ class DenseExpansion:
         states = tuple(np.asarray(v) for v in self.variances(covariance))
         return Spread(own, np.zeros_like(own), states)
 
-    def states(self, factors: Factors) -> tuple[jax.Array, ...]:
+    def states(self, factors: Factors) -> States:
         """Covariance (E, n, n) of every state of each recursion."""
         return _state_covariances(self.trajectories, self.covariance(factors))
 
-    def noises(self, factors: Factors) -> tuple[jax.Array, ...]:
+    def noises(self, factors: Factors) -> States:
         """Variance (E, n) of every whitened noise of each recursion."""
         return marginal_variances(self.model, self.rows, self.trajectories, self.covariance(factors))[1]
 
@@ -175,7 +176,7 @@ class DenseExpansion:
         pairs = zip(self.held_states, moved, strict=True)
         return [np.diagonal(np.asarray(held), axis1=1, axis2=2) + own for held, own in pairs]
 
-    def variances(self, covariance: jax.Array) -> tuple[jax.Array, ...]:
+    def variances(self, covariance: jax.Array) -> States:
         """Variance (E, n) of every state of each recursion, for a covariance (M, M) of the biases."""
         return state_variances(self.trajectories, covariance)
 
@@ -184,7 +185,7 @@ _solved = jax.jit(Dense.of)
 
 
 @jax.jit
-def _state_covariances(trajectories: tuple[Trajectory, ...], covariance: jax.Array) -> tuple[jax.Array, ...]:
+def _state_covariances(trajectories: tuple[Trajectory, ...], covariance: jax.Array) -> States:
     return tuple(
         own.covariance + jnp.einsum("eni,ij,emj->enm", own.response, covariance, own.response) for own in trajectories
     )

@@ -11,6 +11,7 @@ from probcal.gaussian.mode import Point, factors
 from probcal.misfit import Rejected
 from probcal.model.model import Data, Model, Recursion
 from probcal.model.rows import families_at
+from probcal.model.trajectories import States
 from probcal.noise import HALF
 from probcal.problem import Problem
 
@@ -80,7 +81,7 @@ def growing_square(model: Model, point: Point) -> float:
     return square / max(count, 1.0)
 
 
-def state_covariances(model: Model, point: Point) -> tuple[jax.Array, ...]:
+def state_covariances(model: Model, point: Point) -> States:
     """Covariances (E, n, n) of every smoothed state at held biases, linearised at a point."""
     compressed = model.of_states(model.linearise(point, expected=True))
 
@@ -91,7 +92,7 @@ def state_covariances(model: Model, point: Point) -> tuple[jax.Array, ...]:
     return model.each(of, compressed, map(model.entries, range(len(compressed))))
 
 
-def update_levels(model: Model, point: Point, spread: Data, driven: tuple[jax.Array, ...]) -> Point:
+def update_levels(model: Model, point: Point, spread: Data, driven: States) -> Point:
     """One MacKay step of every unknown noise level, kept within its declared factor by its log-normal prior.
 
     A level sigma of N whitened residuals v solves N - sum Var v = sum v^2 (Paper B 25, for noise);

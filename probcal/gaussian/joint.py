@@ -22,7 +22,7 @@ from probcal.gaussian.factor import Entries, leading, mirrored
 from probcal.gaussian.mode import factors, inverse_factors
 from probcal.linalg import outer
 from probcal.model.model import Model
-from probcal.model.rows import Linearised
+from probcal.model.rows import LinearRows
 
 
 def missing(model: Model) -> str:
@@ -106,7 +106,7 @@ class JointPrecision:
         places = Entries(low.astype(np.int32), high.astype(np.int32), size, diagonal, blocks)
         return cls(places, kept, times[kept], tuple(slots), tuple(driven), start, len(rows), extra)
 
-    def values(self, model: Model, lins: tuple[Linearised, ...], levels: jax.Array) -> np.ndarray:
+    def values(self, model: Model, lins: LinearRows, levels: jax.Array) -> np.ndarray:
         """Entries (entries,) of the precision of data and motion, the biases without prior."""
         found = np.asarray(_values(model, lins, levels))
         more = np.zeros(len(self.extra))
@@ -179,7 +179,7 @@ class JointPrecision:
             at += E * (2 * half + n * n)
         return found
 
-    def predicted_variances(self, model: Model, lins: tuple[Linearised, ...], inverse: np.ndarray) -> list[np.ndarray]:
+    def predicted_variances(self, model: Model, lins: LinearRows, inverse: np.ndarray) -> list[np.ndarray]:
         """Variance (N, C) of each predicted value of each block, from the inverse at the places of
         the entries."""
         whole, states = np.zeros(self.count), [own for own, _, _ in self.steps(model, inverse)]
@@ -302,7 +302,7 @@ def _entries(
 
 
 @jax.jit
-def _values(model: Model, lins: tuple[Linearised, ...], levels: jax.Array) -> jax.Array:
+def _values(model: Model, lins: LinearRows, levels: jax.Array) -> jax.Array:
     """Values of the blocks of the joint precision in the order of `_entries`, the diagonal of the
     biases zero."""
     found = []

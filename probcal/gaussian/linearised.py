@@ -23,7 +23,8 @@ from probcal.gaussian.mode import (
 )
 from probcal.gaussian.solves import Dense
 from probcal.model.model import Data, Model, Where
-from probcal.model.rows import Linearised
+from probcal.model.rows import Linearised, LinearRows
+from probcal.model.trajectories import States
 from probcal.priors import Precision
 
 
@@ -56,7 +57,7 @@ class Trajectory(NamedTuple):
 
 
 @jax.jit
-def state_variances(trajectories: Sequence[Trajectory], covariance: jax.Array) -> tuple[jax.Array, ...]:
+def state_variances(trajectories: Sequence[Trajectory], covariance: jax.Array) -> States:
     """Variance (E, n) of every state of each recursion, for a covariance (M, M) of z."""
     return tuple(
         jnp.diagonal(own.covariance, axis1=1, axis2=2)
@@ -68,7 +69,7 @@ def state_variances(trajectories: Sequence[Trajectory], covariance: jax.Array) -
 @jax.jit
 def marginal_variances(
     model: Model, rows: Sequence[Linearised], trajectories: Sequence[Trajectory], covariance: jax.Array
-) -> tuple[Data, tuple[jax.Array, ...]]:
+) -> tuple[Data, States]:
     """Variance (N, C) of each predicted value and (E, n) of every whitened noise, for a covariance (M, M) of z."""
     alone = model.state_variance(rows, [own.covariance for own in trajectories])
     predicted = jax.tree.map(jnp.add, alone, _by_bias(model, rows, trajectories, covariance))
@@ -107,7 +108,7 @@ def given_biases(model: Model, levels: jax.Array, solved: Eliminated) -> tuple[G
     return tuple(found)
 
 
-def linearise_rows(model: Model, point: Where) -> tuple[Linearised, ...]:
+def linearise_rows(model: Model, point: Where) -> LinearRows:
     """All rows linearised at a point with the expected information."""
     return rows_at(model, point, True)
 

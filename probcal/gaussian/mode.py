@@ -19,8 +19,8 @@ from probcal.gaussian.search import DAMPING, ROUNDING, between, branch, damped_o
 from probcal.gaussian.solves import Dense
 from probcal.linalg import library
 from probcal.model.model import At, Model, Recursion, Tail, Where
-from probcal.model.rows import Linearised, level_factors
-from probcal.model.trajectories import Trajectories
+from probcal.model.rows import Linearised, LinearRows, level_factors
+from probcal.model.trajectories import States, Trajectories
 from probcal.priors import Precision
 
 CHORD = 0.1  # share of the last gain up to which what was eliminated serves on
@@ -68,7 +68,7 @@ class Compressed(NamedTuple):
     information: jax.Array  # (M, M) of the biases at fixed trajectories
     score: jax.Array  # (M,)
     states: tuple[tuple[jax.Array, jax.Array], ...]  # of each recursion: J (E, n, n), score (E, n)
-    crosses: tuple[jax.Array, ...]  # (E, n, M) cross information with the biases
+    crosses: States  # (E, n, M) cross information with the biases
 
 
 class Eliminated(NamedTuple):
@@ -201,7 +201,7 @@ def eliminate(model: Model, point: Point, *, expected: bool, joint: bool = True)
 
 
 @jax.jit
-def rows_at(model: Model, point: Where, expected: Any) -> tuple[Linearised, ...]:
+def rows_at(model: Model, point: Where, expected: Any) -> LinearRows:
     """All rows linearised at a point, a kernel for step weights and for the expected information."""
     return model.linearise(point, expected=expected)
 
@@ -213,7 +213,7 @@ def eliminate_rows(model: Model, point: Point, lins: Sequence[Linearised], *, jo
 
 
 @partial(jax.jit, static_argnames="joint")
-def compress_rows(model: Model, z: jax.Array, lins: tuple[Linearised, ...], joint: bool) -> Compressed:
+def compress_rows(model: Model, z: jax.Array, lins: LinearRows, joint: bool) -> Compressed:
     """Rows compressed onto states and biases, with the tilt of the model at z."""
     compressed = compress(model, lins, joint=joint)
     return tilted(model, z, compressed) if joint else compressed
@@ -243,7 +243,7 @@ def tilted(model: Model, z: jax.Array, compressed: Compressed) -> Compressed:
 
 def eliminate_compressed(
     model: Model,
-    noises: tuple[jax.Array, ...],
+    noises: States,
     levels: jax.Array,
     compressed: Compressed,
     *,
@@ -276,7 +276,7 @@ def gains_of(part: Recursion, levels: jax.Array, J: jax.Array, used: tuple[int, 
 @partial(jax.jit, static_argnames="joint")
 def _eliminated(
     model: Model,
-    noises: tuple[jax.Array, ...],
+    noises: States,
     levels: jax.Array,
     told: tuple[jax.Array, jax.Array],
     parts: tuple[Kept, ...],

@@ -20,6 +20,7 @@ from probcal.gaussian.marginal import volume_slope
 from probcal.gaussian.mode import Point, eliminate_rows, factors
 from probcal.geometry import lattice
 from probcal.model.model import TILTED, At, Model, Recursion, Tilt
+from probcal.model.trajectories import States
 
 MOST = 3  # entries of a state that is integrated
 FEW = 2  # poses above the dimension up to which a place may be a ring or one of two
@@ -104,7 +105,7 @@ def _still(model: Model, point: Point) -> tuple[Still, ...] | None:
     return model.each(of, model.targets, resting)
 
 
-def _placed(model: Model, point: Point, still: tuple[Still, ...], u: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+def _placed(model: Model, point: Point, still: tuple[Still, ...], u: States) -> States:
     """States with the chosen targets at whitened places (T, n) of each recursion."""
 
     def placed(part: Recursion, s: Still, own: jax.Array, x: jax.Array) -> jax.Array:
@@ -114,7 +115,6 @@ def _placed(model: Model, point: Point, still: tuple[Still, ...], u: tuple[jax.A
     return model.each(placed, still, u, point.states)
 
 
-States = tuple[jax.Array, ...]
 Look = list[tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
@@ -125,10 +125,10 @@ def _together(model: Model) -> int:
 
 
 @jax.jit
-def _look(model: Model, point: Point, still: tuple[Still, ...], u: tuple[jax.Array, ...]) -> Any:
+def _look(model: Model, point: Point, still: tuple[Still, ...], u: States) -> Any:
     """At `BATCH` whitened places of every target: log density (K, T), its slope (K, T, n) and expected precision."""
 
-    def one(u: tuple[jax.Array, ...]) -> Any:
+    def one(u: States) -> Any:
         at = At(_placed(model, point, still, u), point.z, point.levels)
         told = model.by_target(model.by_epoch(model.log_likelihood(at)))
         own = model.of_states(model.linearise(at, expected=True))
@@ -148,7 +148,7 @@ class PlaceScores(NamedTuple):
     Where they are asked for, squares and information (M, M) too.
     """
 
-    first: tuple[jax.Array, ...]
+    first: States
     second: jax.Array
     information: jax.Array
 

@@ -14,13 +14,14 @@ from probcal.inference.draws import accepted
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, conditional, log_prior
 from probcal.inference.sides import Sided, shifted, side_of
+from probcal.model.trajectories import States
 
 
 class Sample(NamedTuple):
     """One draw as a sampler sees it, and what it says about itself."""
 
     theta: jax.Array  # (Q,)
-    eps: tuple[jax.Array, ...]
+    eps: States
     phi: Phi
     joint: jax.Array  # () log density of data and eps given theta
     stats: dict[str, jax.Array]
@@ -33,7 +34,7 @@ class Draw(NamedTuple):
     phi: Phi
     gamma: jax.Array  # (M,) 1 - alpha Sigma given phi
     variance: jax.Array  # (M,) of each z given phi
-    states: tuple[jax.Array, ...]  # (E, n) of each recursion
+    states: States  # (E, n) of each recursion
     density: jax.Array  # () log density of data, eps and theta given phi
     stats: dict[str, jax.Array]
 

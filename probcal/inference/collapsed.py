@@ -23,6 +23,7 @@ from probcal.inference.leaps import Place, leap
 from probcal.inference.orbits import roam
 from probcal.inference.posed import Conditional, Form, Posed, conditional, prior_precision
 from probcal.inference.sampler import Sampler
+from probcal.model.trajectories import States
 from probcal.priors import Horseshoe, Prior
 
 LEAPS = 4  # tries before a swing, which costs more than all of them
@@ -33,7 +34,7 @@ class CollapsedState(NamedTuple):
     """Where a chain stands."""
 
     theta: jax.Array
-    eps: tuple[jax.Array, ...]
+    eps: States
     phi: Phi
     weight: jax.Array  # log weight of theta and eps
     key: jax.Array
@@ -41,7 +42,7 @@ class CollapsedState(NamedTuple):
 
 def hmc_step(
     posed: Posed, chain: CollapsedState, given: Conditional, key: jax.Array
-) -> tuple[jax.Array, tuple[jax.Array, ...], jax.Array, jax.Array]:
+) -> tuple[jax.Array, States, jax.Array, jax.Array]:
     """Hamiltonian step of theta and eps given phi, a quarter turn in the frame's coordinates.
 
     Returns theta, eps, log weight and whether the step was taken. Its steps are short enough for many epochs that

@@ -18,9 +18,10 @@ from probcal.gaussian.mode import Point
 from probcal.gaussian.places import tilt_at
 from probcal.lazy import pd, xr
 from probcal.linalg import invert
-from probcal.model.model import Recursion
+from probcal.model.model import Data, Recursion
 from probcal.model.motions import level_logs
-from probcal.model.rows import Linearised
+from probcal.model.rows import LinearRows
+from probcal.model.trajectories import States
 from probcal.modes.grid import follow_states, track_mode
 from probcal.priors import Precision
 from probcal.problem import Epochs, Problem
@@ -51,7 +52,7 @@ class Judged:
         return self.expansion.point
 
     @property
-    def lins(self) -> tuple[Linearised, ...]:
+    def lins(self) -> LinearRows:
         """The rows linearised there with the expected information."""
         return self.expansion.rows
 
@@ -59,7 +60,7 @@ class Judged:
         """Arrays (..., N, C) of the blocks as one (..., data)."""
         return gather([np.asarray(part) for part in parts], self.picks)
 
-    def in_blocks(self, values: np.ndarray) -> tuple[jax.Array, ...]:
+    def in_blocks(self, values: np.ndarray) -> Data:
         """Values by datum (data, K) as those of the blocks (N, C, K), zero where nothing is measured."""
         found, parts = [], np.split(values, np.cumsum([len(rows) for rows, _ in self.picks])[:-1])
         for there, pick, own in zip(self.problem.model.measured, self.picks, parts, strict=True):
@@ -151,7 +152,7 @@ def take_up(problem: Problem, fit: xr.DataTree) -> Judged:
     tracked = dict(each_track(fit))
 
     # the problem with the precisions of its process noise that the tracks of a tree hold
-    def saved(part: Recursion, epochs: Epochs) -> tuple[jax.Array, ...]:
+    def saved(part: Recursion, epochs: Epochs) -> States:
         names = weights_of_tails(part)
         own = [saved_by_epoch(epochs, tracked, name, "process noise") for name in names]
         return tuple(jax.device_put(np.where(epochs.target == "", 1.0, weight)) for weight in own)

@@ -149,7 +149,7 @@ def by_propagation(
     `at` where the climb ended.
     """
     first = form.rest(first)
-    known = BiasLikelihood.of(engine, at, Factors.of(first), marginal=marginal)
+    known = BiasLikelihood(engine, at, Factors.of(first), marginal)
     work = Propagation.of(form, first, known, blocks_of(at.model), context.key)
     work.resume(context.run(work)[0])
     swept, here = work.swept, work.likelihood.here
@@ -166,7 +166,7 @@ def joint_draws(work: Propagation) -> tuple[np.ndarray, SensorBlocks]:
     They are ordered as those of the Gaussian of likelihood and sites are (Iman and Conover 1982).
     """
     swept, factors, here = work.swept, work.factors, work.likelihood.here
-    M, whole = work.form.biases, work.likelihood.whole
+    M, whole = work.form.biases, work.likelihood.engine.cheap  # covariance of all biases is made
     shape = (CHAINS, KEPT if whole else few_draws(M))
     count, rng = shape[0] * shape[1], chance_of(work.key)
     ordered = np.asarray(here.deviations(factors, work.key, count).z)

@@ -10,13 +10,14 @@ from probcal.gaussian.search import chosen
 from probcal.inference.gibbs import reversible_sweeps
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed
+from probcal.model.trajectories import States
 
 
 class Place(NamedTuple):
     """Where a chain stands, in the frame's coordinates."""
 
     theta: jax.Array  # (Q,)
-    eps: tuple[jax.Array, ...]
+    eps: States
     phi: Phi
     weight: jax.Array  # log weight
 

@@ -25,7 +25,7 @@ from probcal.inference.posed import Form, Posed, log_prior
 from probcal.linalg import least_squares
 from probcal.model.model import Recursion
 from probcal.model.rows import level_factors
-from probcal.model.trajectories import Trajectories
+from probcal.model.trajectories import States, Trajectories
 from probcal.modes.reflections import place_biases
 from probcal.problem import Problem
 
@@ -53,7 +53,7 @@ class Orbit:
     base: jax.Array  # (nodes, d) stated places
     scale: jax.Array  # (M,)
     centre: jax.Array  # (d,)
-    pinned: tuple[jax.Array, ...]  # pseudo-inverses (E, n, n) of the noise factors of each recursion
+    pinned: States  # pseudo-inverses (E, n, n) of the noise factors of each recursion
     size: jax.Array  # () sd of r by the frame
 
     def vector(self, r: jax.Array, value: jax.Array, *, place: bool) -> jax.Array:
@@ -80,7 +80,7 @@ class Orbit:
             z = z.at[index].add(r / self.scale[index])
         return z
 
-    def states(self, r: jax.Array, states: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    def states(self, r: jax.Array, states: States) -> States:
         """Trajectories (E, n) moved by r."""
         found = []
         for x, spans in zip(states, self.spans, strict=True):

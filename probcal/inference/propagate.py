@@ -72,13 +72,7 @@ class BiasLikelihood:
     engine: Engine
     here: Expansion
     prior: Factors  # of the biases that no hierarchy governs
-    whole: bool  # whether the covariance of all biases is made
     marginal: bool = True  # whether the determinant of the trajectories belongs to it; not at a joint mode
-
-    @classmethod
-    def of(cls, engine: Engine, at: Expansion, prior: Factors, *, marginal: bool = True) -> BiasLikelihood:
-        """The likelihood at an expansion by an engine, and the prior of the biases that no hierarchy governs."""
-        return cls(engine, at, prior, engine.cheap, marginal)
 
     @property
     def z(self) -> np.ndarray:

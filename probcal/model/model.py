@@ -17,7 +17,7 @@ import numpy as np
 from probcal.linalg import library
 from probcal.model import rows as waist
 from probcal.model.epochs import Epoch, Stepwise, merged
-from probcal.model.rows import Block, Linearised, Rows
+from probcal.model.rows import Block, Linearised, LinearRows, Rows
 from probcal.model.sampled import SampledMotion
 from probcal.noise import Normal
 
@@ -241,7 +241,7 @@ class Model(Stepwise):
             for b, (block, data, _, predicted) in enumerate(self.each_block(self.predict(at)))
         )
 
-    def linearise(self, at: Where, *, expected: Any) -> tuple[Linearised, ...]:
+    def linearise(self, at: Where, *, expected: Any) -> LinearRows:
         """Every block linearised at a point, with step weights or the expected information.
 
         Raises `InputError` where a motion has no linear form.
@@ -252,7 +252,7 @@ class Model(Stepwise):
             for block, data, r in self.each_block()
         )
 
-    def linearise_biases(self, at: Where, *, expected: bool) -> tuple[Linearised, ...]:
+    def linearise_biases(self, at: Where, *, expected: bool) -> LinearRows:
         """Every block linearised by the biases alone, whatever the motion: `of_biases` reads it."""
         return tuple(
             waist.linearise_biases(block, data, self.vectors(r, at.states[r]), at.z, at.levels, expected=expected)
@@ -541,7 +541,7 @@ class Model(Stepwise):
         return tuple(function(block, data, own, at.levels) for block, data, _, own in parts)
 
 
-def scaled(lins: Sequence[Linearised], weights: Sequence[Any]) -> tuple[Linearised, ...]:
+def scaled(lins: Sequence[Linearised], weights: Sequence[Any]) -> LinearRows:
     """Rows linearised with every datum counted by a weight (N, C)."""
     pairs = zip(lins, weights, strict=True)
     return tuple(lin._replace(score=lin.score * w, weight=lin.weight * w) for lin, w in pairs)

@@ -111,6 +111,9 @@ class Linearised(NamedTuple):
     bias: jax.Array  # (N, C, p) Jacobian by z
 
 
+LinearRows = tuple[Linearised, ...]  # of each block
+
+
 def make_block(network: Network, kind: SensorType, layout: Layout, flow: tuple[Any, ...] = ()) -> Block:
     """Static part for the sensors of one type; raises `InputError` for a component nobody states."""
     known = {name: (start, stop) for name, start, stop, _ in layout}
