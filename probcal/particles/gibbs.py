@@ -22,6 +22,7 @@ from probcal.inference.chains import Draw, Sample, repeated
 from probcal.inference.draws import slice_step
 from probcal.inference.gibbs import draw_hyper
 from probcal.inference.hierarchy import Phi, hierarchy_of
+from probcal.inference.pose import SPREAD
 from probcal.inference.posed import Form, Natural, conditional, log_prior, prior_precision
 from probcal.inference.posterior import SamplerRun, chains, conclude_draws
 from probcal.inference.sampler import Sampler
@@ -40,7 +41,6 @@ from probcal.priors import Horseshoe, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, Posterior
 
-SPREAD = 1.5  # by how much chains start further out than the data leave the biases
 SEARCH = 40  # iterations of the search for a start, where there is none
 LENGTHS = (1.0, 0.3)  # of steps of all biases; 1 is an independent draw from the Gaussian at given paths
 NEAR, FAR = 0.2, 20.0  # shortest and longest steps of a sensor by itself, in sd at given paths
