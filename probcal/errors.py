@@ -23,7 +23,12 @@ class InputError(ValueError):
     """A declaration, table or argument that cannot be used; the text, one line, says what to do about it."""
 
     def __init__(self, text: object):
-        super().__init__(one_line(text))
+        line, longest = " ".join(str(text).split()), 800  # characters, else its middle is cut out
+        if len(line) > longest:
+            line = f"{line[: longest // 2]} ... {line[-longest // 2 :]}"
+        super().__init__(
+            "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in line)
+        )
 
 
 class FitError(RuntimeError):
@@ -45,7 +50,7 @@ def checked[**P, R](function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def entry(*args: P.args, **kwargs: P.kwargs) -> R:
-        given: dict[str, Any] = dict(zip(parameters, args, strict=False)) | kwargs
+        given = dict(zip(parameters, args, strict=False)) | kwargs
         for name, value in given.items():
             if name in wanted and wanted[name].isdisjoint(kind.__name__ for kind in type(value).__mro__):
                 raise InputError(f"{verb}: {name} is {_described(value)}; give {give[name]}")
@@ -80,9 +85,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f"; known: {shown}" if names else ""
 
 
-def one_line(text: object, width: int = 800) -> str:
-    """Text on one line that can be printed, its middle cut out where it is longer than `width`."""
-    line = " ".join(str(text).split())
-    if len(line) > width:
-        line = f"{line[: width // 2]} ... {line[-width // 2 :]}"
-    return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in line)
+def check_known(name: str, known: Iterable[str], text: str) -> None:
+    """Raise `InputError` for a name that is not known: a text, and the nearest of those that are."""
+    if name not in known:
+        raise InputError(f"{text}{nearest(name, known)}")

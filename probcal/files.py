@@ -184,7 +184,7 @@ class Outputs:
         """Note the files as this package's own, written by a run."""
         self.begin()
         yield
-        self._note({name: [_digest(self.folder / name) or "", run] for name in self.there})
+        self._note({name: [digest_of_file(self.folder / name), run] for name in self.there})
 
     def remove(self, name: str) -> None:
         """Remove a file that this package wrote; any other stays."""
@@ -193,7 +193,7 @@ class Outputs:
 
     def _own(self, name: str) -> bool:
         path, noted = self.folder / name, self._noted()
-        return not path.is_dir() and name in noted and noted[name][0] in ("", _digest(path))
+        return not path.is_dir() and name in noted and noted[name][0] in ("", digest_of_file(path))
 
     def _noted(self) -> dict[str, list[str]]:
         try:
@@ -207,10 +207,10 @@ class Outputs:
         write_whole(self.folder / NOTE, json.dumps(others | changed, indent=1))
 
 
-def _digest(path: Path) -> str | None:
-    """Digest of a file's bytes, None where there is none."""
+def digest_of_file(path: Path) -> str:
+    """Digest of a file, empty where it cannot be read."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
-        return None
+        return ""

@@ -1,5 +1,6 @@
 """Distances and angles with finite gradients everywhere; angles are mathematical (0 east, counter-clockwise)."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -10,6 +11,11 @@ from probcal.errors import InputError
 from probcal.linalg import handedness
 
 TURNED = 1e-3  # by how much a rotation matrix may miss being one, of numbers that were rounded
+
+
+def lattice(axes: Sequence[Any]) -> np.ndarray:
+    """The points (P, d) of a grid with these coordinates along each axis, the last running fastest."""
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(axes))
 
 
 def norm(vector: Any) -> jax.Array:

@@ -66,7 +66,7 @@ class Later:
         # the whole package first, its parts as attributes: ArviZ puts a lazy numpyro into sys.modules, of which
         # `import numpyro.infer` would run the parts twice
         root, *parts = self._path.split(".")
-        found: Any = import_module(root)
+        found = import_module(root)
         for part in parts:
             found = getattr(found, part)
         return getattr(found, name)

@@ -248,6 +248,16 @@ def solve_batched(matrices: jax.Array, right: jax.Array) -> jax.Array:
     return (inverses.mT @ (inverses @ right[:, :, None]))[:, :, 0]
 
 
+def preceding(values: jax.Array) -> jax.Array:
+    """Each entry of a sequence (E, ...) moved to the next, zero at the first."""
+    return jnp.concatenate([jnp.zeros_like(values[:1]), values[:-1]])
+
+
+def outer(vectors: Any) -> Any:
+    """Products (..., p, p) of every two entries of vectors (..., p); of flags whether both hold."""
+    return vectors[..., :, None] * vectors[..., None, :]
+
+
 def library(*leaves: Any) -> Any:
     """The library that computes with these: that of jax where one is traced, else NumPy, which compiles nothing."""
     return jnp if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves) else np

@@ -10,7 +10,7 @@ import numpy as np
 
 from probcal.clocks import CLOCK, by_clock
 from probcal.detection import Detection
-from probcal.errors import InputError, nearest
+from probcal.errors import InputError, check_known
 from probcal.geodesy import LocalFrame
 from probcal.geometry import slopes
 from probcal.labels import AXES, check_name
@@ -135,16 +135,13 @@ class Node:
         # standard deviations by axis, where these differ
         self.sizes: dict[str, tuple[float, ...]] = {}
         for kind, given in (("survey", survey), ("scale", scale)):
-            entries: Mapping[str, Spread] = (
-                given if isinstance(given, Mapping) else {} if given is None else {"position": given}
-            )
+            entries = given if isinstance(given, Mapping) else {} if given is None else {"position": given}
             for component, value in entries.items():
                 self._add(kind, component, value)
 
     def _add(self, kind: str, component: str, value: Spread) -> None:
         known = ["position", *self.components]
-        if component not in known:
-            raise InputError(f'node "{self.name}": {kind} names "{component}"{nearest(component, known)}')
+        check_known(component, known, f'node "{self.name}": {kind} names "{component}"')
         if component in ("pitch", "roll") and self.dimension == 2:
             raise InputError(f'node "{self.name}": {component} has no meaning in 2-D')
         if component in self.spread:
@@ -204,9 +201,7 @@ class Node:
             if not any(label in values for label in labels):
                 continue
             own = self.position if component == "position" else np.atleast_1d(self.components[component])
-            stated: np.ndarray = np.array(
-                [values[k][0] if k in values else v for k, v in zip(labels, own, strict=True)]
-            )
+            stated = np.array([values[k][0] if k in values else v for k, v in zip(labels, own, strict=True)])
             sds = [values[k][1] if k in values else s for k, s in zip(labels, self.spreads(component), strict=True)]
             node.spread[component] = ("survey", replace(bias, scale=max(sds)))
             node.sizes[component] = tuple(sds)
@@ -302,17 +297,14 @@ class Network:
                     f"sensor {kind.name} works in {kind.dimensions[0]}-D only, the network is {self.dimension}-D"
                 )
         self.biases = tuple(self._node_biases() + self._sensor_biases())
-        self._check_labels()
+        for label, count in Counter(bias.label for bias in self.biases).items():
+            if count > 1:
+                raise InputError(f'two biases are called "{label}"; give node, sensor and bias names that differ')
         self._steps: dict[tuple[str, str, int], tuple[BiasRecord, ...]] = {}
         for bias in self.biases:
             if bias.since is not None:
                 key = (bias.owner, bias.component, bias.axis)
                 self._steps[key] = (*self._steps.get(key, ()), bias)
-
-    def _check_labels(self) -> None:
-        for label, count in Counter(bias.label for bias in self.biases).items():
-            if count > 1:
-                raise InputError(f'two biases are called "{label}"; give node, sensor and bias names that differ')
 
     @property
     def labels(self) -> tuple[str, ...]:

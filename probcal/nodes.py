@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from probcal.errors import InputError, nearest
+from probcal.errors import InputError, check_known, nearest
 from probcal.files import parsed_json, write_whole
 from probcal.geodesy import GEODETIC, LocalFrame, check_place, earth_axes
 from probcal.labels import coordinates, step_of, unescaped
@@ -84,7 +84,20 @@ def read_nodes(
     position = np.stack([_stated_place(table, cells[c], c, units[c]) for c in place], -1)
     frame, axes = None, None
     if place[0] == "latitude":
-        frame, axes, position = _to_frame(table, position, origin)
+        # local frame, axes of the attitudes (N, 3, 3) and positions (N, d) of nodes at geodetic places (N, d)
+        for number, (latitude, longitude, *height) in enumerate(position):
+            check_place(table.where(number), latitude, longitude, height[0] if height else 0.0)
+        if isinstance(origin, LocalFrame):
+            frame = origin
+        elif origin is None:  # by the mean of directions, which knows no date line
+            x, y, z = earth_axes(position[:, 0], position[:, 1])[:, 2].mean(axis=0).tolist()
+            middle = np.rad2deg([np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)])
+            frame = LocalFrame(*middle.tolist(), *position[:, 2:].mean(axis=0).tolist())
+        elif isinstance(origin, (Sequence, np.ndarray)) and len(origin) in (2, 3):
+            frame = LocalFrame(*origin)
+        else:
+            raise InputError(f"read_nodes: origin is {origin!r}; give (latitude, longitude) or with a height")
+        axes, position = _reference(frame, position), frame.to_local(*position.T)
     elif origin is not None:
         raise InputError(f"{table.source} states x and y; an origin goes with latitude and longitude, drop it")
     columns = _columns(table, cells, units)
@@ -120,7 +133,7 @@ def _features(path: Path) -> Table:
     records = []
     for row, feature in enumerate(features):
         geometry, properties = (_member(feature, name) for name in ("geometry", "properties"))
-        place: Any = geometry.get("coordinates") if geometry.get("type") == "Point" else None
+        place = geometry.get("coordinates") if geometry.get("type") == "Point" else None
         if not isinstance(place, list) or len(place) not in (2, 3) or not {type(v) for v in place} <= {int, float}:
             raise InputError(f"{table.where(row)} is no Point with coordinates [longitude, latitude] or with a height")
         records.append(properties | dict(zip(("longitude", "latitude", "height"), place, strict=False)))
@@ -167,8 +180,7 @@ def _place_columns(table: Table, cells: pd.DataFrame) -> tuple[str, ...]:
         if column not in chosen:
             raise InputError(f'{table.source} column "{column}" does not go with "{stated[0]}"; drop one of them')
     for column in chosen[:2]:
-        if column not in cells:
-            raise InputError(f'{table.source} has no column "{column}"{nearest(column, cells.columns)}')
+        check_known(column, cells.columns, f'{table.source} has no column "{column}"')
     return chosen if chosen[2] in cells and cells[chosen[2]].notna().any() else chosen[:2]
 
 
@@ -176,25 +188,6 @@ def _stated_place(table: Table, column: pd.Series, name: str, unit: str | None) 
     values, there = numbers(table, column, name)
     table.refuse(~there, name, " is blank; state it for every node")
     return values * unit_factor(table, name, unit, PLACE_UNITS[name])
-
-
-def _to_frame(
-    table: Table, place: np.ndarray, origin: Sequence[float] | LocalFrame | None
-) -> tuple[LocalFrame, np.ndarray, np.ndarray]:
-    """Local frame, axes of the attitudes (N, 3, 3) and positions (N, d) of nodes at geodetic places (N, d)."""
-    for row, (latitude, longitude, *height) in enumerate(place):
-        check_place(table.where(row), latitude, longitude, height[0] if height else 0.0)
-    if isinstance(origin, LocalFrame):
-        frame = origin
-    elif origin is None:  # by the mean of directions, which knows no date line
-        x, y, z = earth_axes(place[:, 0], place[:, 1])[:, 2].mean(axis=0).tolist()
-        middle = np.rad2deg([np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)])
-        frame = LocalFrame(*middle.tolist(), *place[:, 2:].mean(axis=0).tolist())
-    elif isinstance(origin, (Sequence, np.ndarray)) and len(origin) in (2, 3):
-        frame = LocalFrame(*origin)
-    else:
-        raise InputError(f"read_nodes: origin is {origin!r}; give (latitude, longitude) or with a height")
-    return frame, _reference(frame, place), frame.to_local(*place.T)
 
 
 def _columns(table: Table, cells: pd.DataFrame, units: Mapping[str, str | None]) -> dict[str, dict[str, list[Any]]]:
@@ -207,7 +200,11 @@ def _columns(table: Table, cells: pd.DataFrame, units: Mapping[str, str | None])
         kind, _, component = name.partition("_")
         if kind not in KINDS or not component:
             kind, component = "", name
-            _check_component(table, name)
+            if name not in OWN and (name in RESERVED or get_close_matches(name, KNOWN, 1, 0.85)):
+                raise InputError(
+                    f'{table.source} column "{name}" cannot be the name of an extra component,'
+                    f" rename it{nearest(name, KNOWN)}"
+                )
         default = POSE_UNITS.get(component, "1")
         unit = units[name] or default
         values, there = numbers(table, cells[name], name)
@@ -231,14 +228,6 @@ def _bias(table: Table, row: int, unit: str, scale: float) -> Bias:
         return Bias(unit, float(scale))
     except InputError as error:
         raise InputError(f"{table.where(row)}: {error}") from None
-
-
-def _check_component(table: Table, name: str) -> None:
-    """Raise `InputError` for a column that is nearly, but not, the name of one that has a meaning."""
-    if name not in OWN and (name in RESERVED or get_close_matches(name, KNOWN, 1, 0.85)):
-        raise InputError(
-            f'{table.source} column "{name}" cannot be the name of an extra component, rename it{nearest(name, KNOWN)}'
-        )
 
 
 def write_network(path: str | PathLike[str], network: Network) -> Path:
@@ -443,7 +432,7 @@ def _rows(records: list[_Record], frame: LocalFrame | None) -> list[dict[str, An
             name: round(float(v), 6 if PLACE_UNITS[name] == "m" else 11)
             for name, v in zip(columns, place[k], strict=False)
         }
-        row: dict[str, Any] = {"node": record.name} | where
+        row = {"node": record.name} | where
         rows.append(row | dict(cell(*item) for item in (components | record.further).items()))
     return rows
 

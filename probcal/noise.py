@@ -105,6 +105,12 @@ def check_driving(noise: Any, what: str) -> None:
     )
 
 
+def check_driven(component: Any, what: str, *, zero: bool = True) -> None:
+    """Raise `InputError` unless std and noise of a component of a motion can drive it."""
+    check_level(component.std, f"{what} std", zero=zero)
+    check_driving(component.noise, f"{what} noise")
+
+
 def unknowns(family: Any) -> dict[str, Unknown]:
     """The parameters of a family that are unknown, by name; those of a family within it as `noise.share`."""
     found: dict[str, Unknown] = {}
@@ -181,6 +187,11 @@ FAR_OUT = 1e4  # std of the farthest point of a quadrature with estimated parame
 POINTS = 401  # of that quadrature: the information of a mixture is 4e-4 off
 FARTHEST = 30.0  # asinh of the farthest point of a quadrature, in std
 HALF = 0.5  # reliance below which a datum counts as rejected
+HALF_LOG = 0.5 * np.log(2 * np.pi)  # minus the log density of a unit normal at its mean
+# asinh of the points of a quadrature, even there so that tails of any weight are reached
+DEVIATES = np.linspace(-FARTHEST, FARTHEST, 20_001)
+# points of a quadrature for parameters (S, 1)
+WIDE = np.sinh(np.linspace(-np.arcsinh(FAR_OUT), np.arcsinh(FAR_OUT), POINTS))[None]
 
 
 class Family:
@@ -344,8 +355,8 @@ class AdditiveNoise(Family):
             return _information_of(self)
         # the same in fewer points, which are an axis more of parameters that are estimated, () or (S,)
         own, shape = _upright(self)
-        e = own._points(jnp.sinh(np.linspace(-np.arcsinh(FAR_OUT), np.arcsinh(FAR_OUT), POINTS))[None])
-        return _trapezoid(own._slope(e) ** 2 * jnp.exp(own.log_density(e)), e).reshape(shape)
+        e = own._points(WIDE)
+        return jnp.trapezoid(own._slope(e) ** 2 * jnp.exp(own.log_density(e)), e).reshape(shape)
 
     def _points(self, e):
         """Residuals over the std (increasing) at which a quadrature looks, from those that suit a wide density."""
@@ -363,21 +374,18 @@ def _upright(family: Any) -> tuple[Any, tuple[int, ...]]:
     return own, jnp.broadcast_shapes(*(value.shape for value in values.values()))
 
 
-def _trapezoid(values: Any, e: Any) -> Any:
-    """Integral of values (..., P) at points (P,) or (..., P) by the trapezoidal rule."""
-    return jnp.sum(0.5 * (values[..., 1:] + values[..., :-1]) * jnp.diff(e), -1)
+def _evaluated(law: Callable[..., Any], *at: Any) -> np.ndarray:
+    """Values of a function at points, in double precision, also while another is traced."""
+    with jax.enable_x64(True), jax.ensure_compile_time_eval():
+        return np.asarray(jax.jit(law)(*at))
 
 
 @lru_cache
 def _information_of(family: AdditiveNoise) -> float:
-    """Mean square of a family's score at std 1; points are even in asinh, so that tails of any weight are reached."""
-    t = np.linspace(-FARTHEST, FARTHEST, 20_001)
-    with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        e = np.sinh(t)
-        log, slope = (np.asarray(jax.jit(law)(e)) for law in (family.log_density, family._slope))
-    density = np.exp(log)
-    inside = density > 0
-    return float(np.trapezoid(np.where(inside, slope**2 * density * np.cosh(t), 0.0), t))
+    """Mean square of a family's score at std 1."""
+    t, e = DEVIATES, np.sinh(DEVIATES)
+    density, slope = np.exp(_evaluated(family.log_density, e)), _evaluated(family._slope, e)
+    return float(np.trapezoid(np.where(density > 0, slope**2 * density * np.cosh(t), 0.0), t))
 
 
 @lru_cache
@@ -388,18 +396,15 @@ def normal_scores(family: Any) -> tuple[np.ndarray, np.ndarray]:
     """
     from scipy import special
 
-    t, family = np.linspace(-FARTHEST, FARTHEST, 20_001), at_guess(family)
-    e = np.sinh(t)
+    e, family = np.sinh(DEVIATES), at_guess(family)
     if not isinstance(family, AdditiveNoise):
         return e, np.zeros_like(e)
     if isinstance(family, Normal | Heard):
         return e, e
-    with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        log = jax.jit(family.log_likelihood)(e, np.zeros_like(e), np.ones_like(e), None)
-    density = np.exp(np.asarray(log))
-    mass = density * np.cosh(t)
-    below = np.concatenate([[0.0], np.cumsum(0.5 * (mass[1:] + mass[:-1]))])
-    above = np.concatenate([np.cumsum((0.5 * (mass[1:] + mass[:-1]))[::-1])[::-1], [0.0]])
+    log = _evaluated(family.log_likelihood, e, np.zeros_like(e), np.ones_like(e), None)
+    mass = np.exp(log) * np.cosh(DEVIATES)
+    steps = 0.5 * (mass[1:] + mass[:-1])
+    below, above = np.append(0.0, np.cumsum(steps)), np.append(np.cumsum(steps[::-1])[::-1], 0.0)
     lower, total = below < above, max(below[-1], 1e-300)
     tail = np.maximum(np.where(lower, below, above) / total, 1e-300)
     return e, np.maximum.accumulate(np.where(lower, 1.0, -1.0) * special.ndtri(tail))
@@ -411,9 +416,7 @@ def _rejects(family: Any) -> float:
     from scipy import special
 
     e, score = normal_scores(family)
-    with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        relied = jax.jit(family.reliance)(e, np.zeros_like(e), np.ones_like(e), None)
-    low = np.asarray(relied) < HALF
+    low = _evaluated(family.reliance, e, np.zeros_like(e), np.ones_like(e), None) < HALF
     return float(np.diff(special.ndtr(score)) @ (0.5 * low[1:] + 0.5 * low[:-1]))
 
 
@@ -437,7 +440,7 @@ class Normal(AdditiveNoise):
     def log_likelihood(self, y, predicted, std, period):
         """Log density of each datum."""
         r = self.innovation(y, predicted, period) / std
-        return -0.5 * r**2 - jnp.log(std) - 0.5 * np.log(2 * np.pi)
+        return -0.5 * r**2 - jnp.log(std) - HALF_LOG
 
     def score(self, y, predicted, std, period):
         """Derivative of the log density by the predicted value."""
@@ -463,10 +466,8 @@ class Normal(AdditiveNoise):
 @lru_cache
 def _level_moments(family: AdditiveNoise) -> tuple[float, float]:
     """Expected square of the derivative l of a log density by log std, and of its product with the score, at std 1."""
-    e = np.sinh(np.linspace(-FARTHEST, FARTHEST, 20_001))
-    with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        found = jax.jit(_moments, static_argnums=0)(family, e)
-    return float(found[0]), float(found[1])
+    square, cross = _evaluated(lambda e: jnp.stack(_moments(family, e)), np.sinh(DEVIATES)).tolist()
+    return square, cross
 
 
 def _moments(family: AdditiveNoise, e: Any) -> tuple[Any, Any]:
@@ -476,7 +477,7 @@ def _moments(family: AdditiveNoise, e: Any) -> tuple[Any, Any]:
     score, level = family.score(e, none, one, None), family.level_score(e, none, one, None) - 1.0
     there = p > 0
     square, cross = (jnp.where(there, part, 0.0) for part in (p * level**2, p * score * level))
-    return _trapezoid(square, e), _trapezoid(cross, e)
+    return jnp.trapezoid(square, e), jnp.trapezoid(cross, e)
 
 
 @dataclass(frozen=True)
@@ -500,8 +501,11 @@ class Growing(Family):
         return s, self.slope**2 * predicted / s**2
 
     def _moments(self):
-        """Moments of the derivative by log std: numbers, or arrays of parameters that are estimated."""
-        return _level_moments(at_guess(self.noise)) if not _estimated(self.noise) else _moments_estimated(self.noise)
+        """Moments of the derivative by log std: numbers, or arrays of estimated parameters."""
+        if _functions(*self.noise.__dict__.values()) is np:
+            return _level_moments(at_guess(self.noise))
+        own, shape = _upright(self.noise)
+        return [part.reshape(shape) for part in _moments(own, WIDE)]
 
     def innovation(self, y, predicted, period):
         """Measured value minus the predicted one."""
@@ -568,19 +572,6 @@ class GrowingWithMeasured(Growing):
     def weight(self, y, predicted, std, period):
         """Positive curvature used by a step."""
         return self.noise.weight(y, predicted, self.spread(y, std), period)
-
-
-def _estimated(family: Any) -> bool:
-    """True where parameters of a family are estimated: arrays replace the numbers."""
-    return _functions(*family.__dict__.values()) is jnp
-
-
-def _moments_estimated(family: Any) -> tuple[Any, Any]:
-    """The moments of a family whose parameters are arrays () or (N,)."""
-    own, shape = _upright(family)
-    e = jnp.sinh(np.linspace(-np.arcsinh(FAR_OUT), np.arcsinh(FAR_OUT), POINTS))[None]
-    square, cross = _moments(own, e)
-    return square.reshape(shape), cross.reshape(shape)
 
 
 @dataclass(frozen=True)
@@ -685,7 +676,6 @@ def _late_half_normal(x, scale):
     return density, x / square - steep * ratio, 1.0 / square + steep**2 * curved
 
 
-HALF_LOG = 0.5 * np.log(2 * np.pi)
 LATE = {NORMAL: _late_normal, EXPONENTIAL: _late_exponential, HALF_NORMAL: _late_half_normal}
 
 
@@ -756,9 +746,8 @@ class Mixture(AdditiveNoise):
         inner = np.linspace(-12.0, 12.0, 20_001)
         wide = self.scale * (inner if self.late == NORMAL else np.linspace(0.0, 40.0, 20_001))
         r = np.union1d(np.append(inner, self.delay + inner), self.delay + wide)
-        with jax.enable_x64(True), jax.ensure_compile_time_eval():
-            log, slope = (np.asarray(jax.jit(law)(r)) for law in (self.log_density, self._slope))
-        return float(np.trapezoid(slope**2 * np.exp(log), r))
+        density, slope = np.exp(_evaluated(self.log_density, r)), _evaluated(self._slope, r)
+        return float(np.trapezoid(slope**2 * density, r))
 
     def unit_information(self) -> Any:
         """Expected information at std 1."""
@@ -837,7 +826,7 @@ SMALLEST = 1e-9  # weight of a datum that says nothing, times std^2
 
 def _mills(a):
     """Normal density over its distribution function at a, for any a."""
-    return jnp.exp(-0.5 * a**2 - 0.5 * np.log(2 * np.pi) - log_ndtr(a))
+    return jnp.exp(-0.5 * a**2 - HALF_LOG - log_ndtr(a))
 
 
 @dataclass(frozen=True)
@@ -886,11 +875,7 @@ class Heard(AdditiveNoise):
 
     def emit(self, key, predicted, std):
         """Draw what reaches the receiver, heard or not."""
-        return predicted + std * jax.random.normal(key, predicted.shape, predicted.dtype)
-
-    def _log_normal(self, y, predicted, std):
-        """Log density of a value, heard or not."""
-        return -0.5 * (((y - predicted) / std) ** 2 + np.log(2 * np.pi)) - jnp.log(std)
+        return Normal().sample(key, predicted, std)
 
 
 @dataclass(frozen=True)
@@ -904,7 +889,6 @@ class Censored(Heard):
     0.5
     """
 
-    floor: float | None = None
     blanks: bool = False
 
     def reported(self, y):
@@ -923,7 +907,7 @@ class Censored(Heard):
     def log_likelihood(self, y, predicted, std, period):
         """Log density of what is heard, log probability of the rest."""
         nothing = log_ndtr(self._below(predicted, std))
-        return jnp.where(y <= self.known(), nothing, self._log_normal(y, predicted, std))
+        return jnp.where(y <= self.known(), nothing, Normal().log_likelihood(y, predicted, std, None))
 
     def weight(self, y, predicted, std, period):
         """Curvature, which is positive."""
@@ -955,8 +939,6 @@ class Truncated(Heard):
     0.199471
     """
 
-    floor: float | None = None
-
     def reported(self, y):
         """Nothing (NaN) where nothing is heard."""
         return np.where(y > self.known(), y, np.nan)
@@ -967,7 +949,7 @@ class Truncated(Heard):
 
     def log_likelihood(self, y, predicted, std, period):
         """Log density of each datum, given that it was heard."""
-        return self._log_normal(y, predicted, std) - log_ndtr(self._above(predicted, std))
+        return Normal().log_likelihood(y, predicted, std, None) - log_ndtr(self._above(predicted, std))
 
     def information(self, predicted, std):
         """Expected information about the predicted value."""

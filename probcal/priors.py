@@ -104,7 +104,7 @@ class Prior:
         for pattern, value in pairs:
             if not -1 < value < 1:
                 raise InputError(f'correlation "{pattern}" is {value:g}: it must lie between -1 and 1')
-        kinds: Any = tuple(self.kinds.items() if isinstance(self.kinds, Mapping) else self.kinds)
+        kinds = tuple(self.kinds.items() if isinstance(self.kinds, Mapping) else self.kinds)
         for pattern, prior in kinds:
             if not isinstance(prior, Prior) or isinstance(prior, Flat) or prior.kinds:
                 raise InputError(
@@ -219,8 +219,8 @@ class Prior:
 class Flat(Prior):
     """No prior: maximum likelihood."""
 
-    proper: ClassVar[bool] = False
-    first: ClassVar[float] = 0.0
+    proper = False
+    first = 0.0
 
 
 @dataclass(frozen=True)
@@ -238,11 +238,11 @@ class Laplace(Prior):
     Its mode is found as a Gaussian scale mixture: precision sqrt(2) / |z|, renewed at every iteration.
     """
 
-    learns: ClassVar[bool] = True
-    hierarchical: ClassVar[bool] = True
-    proper: ClassVar[bool] = False  # what Laplace's method gives at a corner is no evidence
+    learns = True
+    hierarchical = True
+    proper = False  # what Laplace's method gives at a corner is no evidence
     rate: ClassVar[float] = float(np.sqrt(2.0))
-    note: ClassVar[str] = "l1: given the scale mixture at the mode, no posterior intervals"
+    note = "l1: given the scale mixture at the mode, no posterior intervals"
 
     def learn(self, gamma: jax.Array, variance: jax.Array, z: jax.Array, group: jax.Array, rule: str) -> jax.Array:
         """Precision of the Gaussian that touches the density at z."""
@@ -284,8 +284,8 @@ class ARD(Prior):
     rate: float = 0.0
     by: str | None = None
 
-    learns: ClassVar[bool] = True
-    hierarchical: ClassVar[bool] = True
+    learns = True
+    hierarchical = True
 
     def __post_init__(self):
         super().__post_init__()
@@ -332,7 +332,7 @@ class Horseshoe(Prior):
     slab_df: float = 4.0
     by: str | None = "vector"
 
-    hierarchical: ClassVar[bool] = True
+    hierarchical = True
 
     def __post_init__(self):
         super().__post_init__()
@@ -370,8 +370,8 @@ class BernoulliGaussian(Prior):
     a: float = 1.0
     b: float = 1.0
 
-    hierarchical: ClassVar[bool] = True
-    dense: ClassVar[bool] = False
+    hierarchical = True
+    dense = False
 
     def __post_init__(self):
         super().__post_init__()

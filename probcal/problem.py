@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from numbers import Real
 from os import PathLike
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from probcal.clocks import CLOCK
-from probcal.errors import InputError, nearest
+from probcal.errors import InputError, check_known, nearest
 from probcal.labels import NOBODY
 from probcal.lazy import pd
 from probcal.linalg import handedness
@@ -46,6 +45,7 @@ from probcal.motion.components import Remembered
 from probcal.network import BiasRecord, Network, Node
 from probcal.noise import Bernoulli, guess_of
 from probcal.plausible import check_plausible, check_scales
+from probcal.priors import Precision, Prior
 from probcal.scans import Scans, assigned_rows, scans_of
 from probcal.sensor import Sensor
 from probcal.table import (
@@ -209,6 +209,10 @@ class Problem:
             )
         return found
 
+    def first_precision(self, prior: Prior) -> Precision:
+        """Precisions of the biases before any is learnt, and the couplings of correlated ones."""
+        return prior.precision(self.labels, self.surveyed)
+
     def unlinked(self) -> Problem:
         """The same problem without motion: the state of every epoch is free, but for known and static targets."""
         check_linear(self)
@@ -270,8 +274,8 @@ class Problem:
         lengths = [1.0, float(np.linalg.norm(np.ptp(self.node_positions, axis=0)))]
         counts = self.measurements.weight > 0
         for j, name in enumerate(self.measurements.channels):
-            units = {dict(t.expand(self.network.dimension))[name].unit for t in self.network.types
-                     if name in dict(t.expand(self.network.dimension))}  # fmt: skip
+            declared = (c for t in self.network.types for c in t.expand(self.network.dimension))
+            units = {channel.unit for own, channel in declared if own == name}
             there = self.measurements.value[self.measurements.measured[:, j] & counts, j]
             if units == {"m"} and len(there):
                 lengths.append(float(np.quantile(np.abs(there), 0.99)))
@@ -287,11 +291,6 @@ class Problem:
         other = copy(self)
         vars(other).update(parts)
         return other
-
-    def _compiled(self) -> Problem:
-        """The problem with its arrays made anew."""
-        self._compile()
-        return self
 
     def rebuild(self, data: Any = None, **changes: Any) -> Problem:
         """The same problem with other data, another network or other fixed biases."""
@@ -361,7 +360,7 @@ class Problem:
         """The same problem, whose clocks that run count from a time in s on, by default that of the first row."""
         if begin == self.begin or not self.clocks.any():
             return self
-        return self._with(begin=begin)._compiled()
+        return self._with(begin=begin)._compile()
 
     @float64
     def at_times(self, moved: np.ndarray, timed: dict[str, float]) -> Problem:
@@ -371,7 +370,7 @@ class Problem:
         """
         if np.array_equal(moved, self.moved):
             return self
-        return self._with(moved=moved, timed=timed)._compiled()
+        return self._with(moved=moved, timed=timed)._compile()
 
     def lateness(self, z: Any) -> np.ndarray:
         """Seconds (N,) from where each row is taken to where its clock puts it at biases z (M,)."""
@@ -516,7 +515,7 @@ class Problem:
                 f" {before[n]:g}"
             )
         other = self._with(measurements=measured, moved=np.zeros(len(measured.time)), silent=silent)
-        other._compile(last, further=True)
+        other._compile(last)
         slots = {n: k for e in self.epochs for k, n in enumerate(e.members)}
         sizes = self.model.sizes if sizes is None else sizes
         return jax.device_put(merged(self._aligned(other, slots)[0], self.model.rows, sizes))
@@ -529,7 +528,7 @@ class Problem:
         motion that the rows have must be in this problem. Raises `InputError` as `Problem`.
         """
         other = self._with(measurements=self._at_epochs(data), moved=np.zeros(len(data.time)), silent=())
-        other._compile(begun, further=True)
+        other._compile(begun)
         model, pairs = self._aligned(other, slots)
         found = {(block, r): rows for block, _, r, rows in other.model.each_block(other.row_index)}
         none = np.zeros(0, int)
@@ -548,8 +547,9 @@ class Problem:
         targets = [[] if r is None else [slots[n] for n in other.epochs[r].members] for r in pairs]
         return aligned(self.model, other.model, pairs, targets), pairs
 
-    def _compile(self, begun: Mapping[str, float] = MappingProxyType({}), *, further: bool = False) -> None:
-        """Arrays of the rows; with `further`, after others: targets in `begun` go on from an epoch at that time."""
+    def _compile(self, after: Mapping[str, float] | None = None) -> Problem:
+        """The problem with arrays of its rows; of later ones targets go on from epochs at times."""
+        begun, further = after or {}, after is not None
         levels = Levels(self.levels if further else ())
         self.longest = self._longest(begun, further)
         forms = self._forms(levels)
@@ -585,8 +585,7 @@ class Problem:
         )
         # put, not `asarray`: that compiles a copy for every new shape; later rows are put when they are epochs
         self.model = model if further else jax.device_put(model, may_alias=False)
-        if self.roomy and not further:
-            self._longer()
+        return self._longer() if self.roomy and not further else self
 
     def _longest(self, begun: Mapping[str, float], further: bool) -> float:
         """The longest time in s between two epochs of a target; of rows that come later, what it was before them."""
@@ -641,7 +640,13 @@ class Problem:
             times.append(time)
             offset += len(time)
         columns: list[Any] = [np.concatenate(column) for column in zip(*parts, strict=True)]
-        recursion = Recursion(*columns)._replace(tails=_tails(drives, offset))
+        # the noises of a recursion that are not Gaussian, targets of one family joined; each with its first epoch
+        joined: dict[Any, np.ndarray] = {}
+        for (*key, on), begin in drives:
+            whole = joined.setdefault(tuple(key), np.zeros(offset, bool))
+            whole[begin : begin + len(on)] = on
+        found = [(*key, on, np.ones(offset)) for key, on in joined.items()]
+        recursion = Recursion(*columns)._replace(tails=tuple(Tail(*own) for own in found))
         owners = np.repeat(names, [len(time) for time in times])
         order = np.concatenate(orders)
         epochs = Epochs(np.concatenate(times), owners, layout, labels_of(layout, dimension), order, flow)
@@ -668,30 +673,27 @@ class Problem:
         """Rows by sensor type and recursion."""
         found = []
         for kind in self.network.types:
-            sensors = [placed.name for placed in self.network.sensors if placed.type == kind]
+            ours = [k for k, placed in enumerate(self.network.sensors) if placed.type == kind]
+            sensors = [self.network.sensors[k].name for k in ours]
             level_of = channel_levels(kind, self.network.dimension, levels, sensors)
             columns = tuple(name for name, _ in kind.expand(self.network.dimension))
             for r, own in enumerate(chained):
-                chosen = self._rows_of(kind, own.epoch_of >= 0)
+                chosen = np.flatnonzero((own.epoch_of >= 0) & np.isin(self.measurements.sensor, ours))
                 if len(chosen):
                     block = make_block(self.network, kind, own.epochs.layout, own.epochs.flow)
-                    numbers, pieces = self._rows(block, chosen, own.epoch_of[chosen], level_of)
+                    epoch = own.epoch_of[chosen]
+                    numbers, pieces = self._rows(block, ours, chosen, epoch, level_of)
                     unknown = parameters(kind, self.network.dimension, levels, sensors, pieces)
                     memory = tuple((c, tuple(np.repeat(own, pieces).tolist())) for c, own in block.memory)
                     block = replace(block, unknown=unknown, memory=memory) if unknown or memory else block
                     found.append(_Gathered(block, Rows(**numbers), r, chosen, columns))
         return found
 
-    def _rows_of(self, kind: Any, inside: np.ndarray) -> np.ndarray:
-        ours = [k for k, placed in enumerate(self.network.sensors) if placed.type == kind]
-        return np.flatnonzero(inside & np.isin(self.measurements.sensor, ours))
-
     def _rows(
-        self, block: Block, chosen: np.ndarray, epoch: np.ndarray, level_of: np.ndarray
+        self, block: Block, ours: list[int], chosen: np.ndarray, epoch: np.ndarray, level_of: np.ndarray
     ) -> tuple[dict[str, Any], list[int]]:
         """Numbers of a block of rows, by the names of `Rows`, and the number of pieces of each sensor."""
         data, network = self.measurements, self.network
-        ours = [k for k, placed in enumerate(network.sensors) if placed.type == block.type]
         sensor = np.searchsorted(ours, data.sensor[chosen])
         level = level_of[sensor]
         nodes = [network.sensors[k].nodes for k in ours]
@@ -791,16 +793,6 @@ def _epochs(
     return found[order], order, np.argsort(order)[own.ravel()]
 
 
-def _tails(drives: list[tuple[Any, int]], epochs: int) -> tuple[Tail, ...]:
-    """The noises of a recursion that are not Gaussian, targets of one family joined; each with its first epoch."""
-    joined: dict[Any, np.ndarray] = {}
-    for (*key, on), first in drives:
-        whole = joined.setdefault(tuple(key), np.zeros(epochs, bool))
-        whole[first : first + len(on)] = on
-    found: list[Any] = [(*key, on, np.ones(epochs)) for key, on in joined.items()]
-    return tuple(Tail(*own) for own in found)
-
-
 def positions_of(network: Network) -> np.ndarray:
     """Stated positions of all nodes (the points of its path for a moving one), shape (points, d)."""
     return np.concatenate([n.position[None] if n.path is None else n.path.position for n in network.nodes])
@@ -838,8 +830,7 @@ def _stated_target(motion: Any, name: str, network: Network) -> Target:
             ' read no target need none: leave their column "target" blank'
         )
     if isinstance(motion, Mapping):
-        if name not in motion:
-            raise InputError(f'target "{name}" has no motion{nearest(name, motion)}')
+        check_known(name, motion, f'target "{name}" has no motion')
         motion = motion[name]
     return motion if isinstance(motion, Target) else Target(motion)
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.detection import Detection
-from probcal.errors import InputError, nearest
+from probcal.errors import InputError, check_known, nearest
 from probcal.fingerprint import computes
 from probcal.labels import AXES, check_name
 from probcal.noise import AdditiveNoise, Bernoulli, Family, Growing, Grows, Heard, Memory, Normal, check_level
@@ -273,8 +273,7 @@ class SensorType:
         if detection is not None:
             known = {f"{n}_{axis}" if c.per_axis else n for n, c in self.channels.items() for axis in AXES}
             for channel, _ in detection.limits:
-                if channel not in known:
-                    raise InputError(f'{self.name}: detection limits "{channel}"{nearest(channel, known)}')
+                check_known(channel, known, f'{self.name}: detection limits "{channel}"')
         name = "-".join(str(node.name) for node in nodes) if name is None else str(name)
         check_name(f"{self.name}: a sensor", name)
         return Sensor(self, tuple(nodes), name, detection)
@@ -348,10 +347,10 @@ def _probe(
     function: Callable, arity: int, biases: Mapping[str, Bias], vectors: frozenset[str]
 ) -> tuple[Any, set[str], set[str], list[int]]:
     """Call the function on probes in 2-D, then 3-D: its channels, what it asks for, and where it works."""
-    failure: Exception | None = None
-    returned: Any = None
-    target_asked: set[str] = set()
-    pose_asked: set[str] = set()
+    failure = None
+    returned = None
+    target_asked = set()
+    pose_asked = set()
     dimensions = []
     for dimension in (2, 3):
         target: set[str] = set()

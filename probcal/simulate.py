@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.errors import InputError, nearest
+from probcal.errors import InputError, check_known
 from probcal.files import write_whole
 from probcal.labels import NOBODY, coordinates, listed, unescaped
 from probcal.lazy import pd
@@ -181,8 +181,7 @@ def _columns(table: Table, **wanted: str) -> pd.DataFrame:
     names, units = header(table)
     frame = table.frame.set_axis(names, axis=1)
     for name, unit in wanted.items():
-        if name not in names:
-            raise InputError(f'truth {table.source} has no column "{name}"{nearest(name, names)}')
+        check_known(name, names, f'truth {table.source} has no column "{name}"')
         values, there = numbers(table, frame[name], name)
         blank = np.flatnonzero(~there)
         if len(blank):
@@ -200,8 +199,7 @@ def _tracks(table: Table) -> pd.DataFrame:
 def _biases_of(table: Table) -> dict[str, float]:
     """True biases by label, from columns bias and value."""
     frame = _columns(table, value="1")
-    if "bias" not in frame:
-        raise InputError(f'truth {table.source} has no column "bias"{nearest("bias", frame.columns)}')
+    check_known("bias", frame.columns, f'truth {table.source} has no column "bias"')
     return dict(zip(frame["bias"].astype(str).map(unescaped), frame["value"].tolist(), strict=True))
 
 
@@ -285,7 +283,7 @@ def _detections(
         told = [placed[str(name)].detection for name in plan["sensor"].to_numpy()[index]]
         chance = np.array([1.0 if own is None else own.chance for own in told])
         for view in {own.view for own in told if own is not None and own.view is not None}:
-            seen: Any = rows.look(block, data, jnp.asarray(states[r]), jnp.asarray(z), view)
+            seen = rows.look(block, data, jnp.asarray(states[r]), jnp.asarray(z), view)
             mine = np.array([own is not None and own.view == view for own in told])
             chance = np.where(mine, chance * np.asarray(seen, float), chance)
         kept[index] = rng.uniform(size=len(index)) < chance
@@ -300,7 +298,7 @@ def _detections(
         own, kind = placed[str(name)].detection, placed[str(name)].type
         assert own is not None
         count = rng.poisson(own.rate)
-        false: dict[str, Any] = {"time": np.full(count, time), "sensor": np.full(count, name, object)}
+        false = {"time": np.full(count, time), "sensor": np.full(count, name, object)}
         for channel, declared in kind.expand(network.dimension):
             pair = own.within(channel, declared.unit, declared.period)
             if pair is None and own.rate:
@@ -358,8 +356,7 @@ def _biases(problem: Problem, share: float, given: Mapping[str, float] | None, k
     if given is not None:
         z[:] = 0.0
         for label, value in given.items():
-            if label not in problem.labels:
-                raise InputError(f'simulate: no bias is called "{label}"{nearest(label, problem.labels)}')
+            check_known(label, problem.labels, f'simulate: no bias is called "{label}"')
             m = problem.labels.index(label)
             z[m] = value / problem.scales[m]
     return z

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from numbers import Number
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from probcal.errors import InputError, nearest
+from probcal.errors import InputError, check_known, nearest
 from probcal.labels import NOBODY, check_name, escaped, unescaped
 from probcal.lazy import pd
 from probcal.network import Network
@@ -146,8 +146,14 @@ def _parsed(path: Path, content: Path | bytes, number: int = 2) -> Table:
 
     try:
         first = pd.read_csv(source(), header=None, nrows=1, dtype=str, keep_default_na=False, **form)
-        _check_separator(path, first.iloc[0].tolist())
         columns = _once(path, first.iloc[0].tolist())
+        for mark, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
+            if any(mark in column for column in columns):
+                raise InputError(
+                    f"{path.name}: its columns are parted by {name}; write commas, with decimal"
+                    f" points in the numbers, or give the DataFrame of pandas.read_csv(path,"
+                    f" sep={mark!r}), with decimal=',' where commas are decimal"
+                )
         text = [column for column in columns if split_header(column)[0] in NAMES]
         form |= {"na_values": dict.fromkeys(columns, BLANK) | dict.fromkeys(text, ("",)), "keep_default_na": False}
         with warnings.catch_warnings():
@@ -162,16 +168,6 @@ def _parsed(path: Path, content: Path | bytes, number: int = 2) -> Table:
     lines = np.arange(number, len(frame) + number)
     filled = frame.notna().any(axis=1).to_numpy()
     return Table(frame[filled].reset_index(drop=True), path.name, lines[filled])
-
-
-def _check_separator(path: Path, header: Sequence[str]) -> None:
-    """Raise `InputError` where the cells of a header hold a separator other than the comma."""
-    for mark, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
-        if any(mark in cell for cell in header):
-            raise InputError(
-                f"{path.name}: its columns are parted by {name}; write commas, with decimal points in the numbers, or "
-                f"give the DataFrame of pandas.read_csv(path, sep={mark!r}), with decimal=',' where commas are decimal"
-            )
 
 
 def _once(path: Path, columns: list[str]) -> list[str]:
@@ -190,13 +186,11 @@ def measure(table: Table, network: Network, *, repeated: bool = False) -> Measur
     names, units = header(table)
     frame = table.frame.set_axis(names, axis=1)
     for column in ("time", "sensor"):
-        if column not in names:
-            raise InputError(f'{table.source} has no column "{column}"{nearest(column, names)}')
+        check_known(column, names, f'{table.source} has no column "{column}"')
     channels = network.channel_names
     allowed = ["time", "sensor", "target", *channels, *(f"{c}_std" for c in channels), "weight"]
     for name in names:
-        if name not in allowed:
-            raise InputError(f'{table.source} column "{name}" is not a channel of the network{nearest(name, allowed)}')
+        check_known(name, allowed, f'{table.source} column "{name}" is not a channel of the network')
     if frame.empty:
         raise InputError(f"{table.source} has no rows")
     sensor = _sensors(table, frame["sensor"], network)

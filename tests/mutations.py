@@ -37,8 +37,8 @@ MUTATIONS = [
     Mutation("moved[place[b]] -= apart", "moved[place[b]] += apart", "test_labels.py"),
     Mutation("2.0 * float(special.stdtr(df, -np.sqrt(df)))", "float(special.stdtr(df, -np.sqrt(df)))", "test_labels.py"),
     # analysis/slopes.py, analysis/recoded.py
-    Mutation("np.minimum(self.fit.factors.diagonal(len(held)), most)", "self.fit.factors.diagonal(len(held))", "test_slopes.py"),
-    Mutation("information = (inverse[k] - np.diag(own[k]))", "information = inverse[k]", "test_slopes.py"),
+    Mutation("if not gain > CONFIRMED * expected:", "if not gain > 1e9:", "test_slopes.py"),
+    Mutation("(inverse[k] - np.diag(held[members]))[np.ix_", "inverse[k][np.ix_", "test_slopes.py"),
     Mutation("changes = [] if slopes.ratio > first else changes", "pass", "test_slopes.py"),
     Mutation('f"look like {other}": lambda value: quarter - value,', "", "test_slopes.py"),
     # gaussian/selected.py
@@ -156,11 +156,11 @@ MUTATIONS = [
     # model/rows.py
     Mutation("rows.base + rows.scale * padded", "rows.base - rows.scale * padded", "test_exact.py"),
     Mutation("Linearised(score, weight, by_state, by_bias * rows.scale[rows.sensor][:, None, :])", "Linearised(score, weight, by_state, by_bias)", "test_exact.py"),
-    Mutation("return rows.std * factors[rows.level]", "return rows.std", "test_formulas.py"),
+    Mutation("return rows.std * level_factors(levels)[rows.level]", "return rows.std", "test_formulas.py"),
     Mutation("score / jnp.sqrt(jnp.where(there, information, 1.0))", "score / jnp.where(there, information, 1.0)", "test_assess.py"),
     Mutation("jnp.mod(value + channel.period / 2, channel.period)", "jnp.mod(value, channel.period)", "test_formulas.py"),
     # noise.py
-    Mutation("return -0.5 * r**2 - jnp.log(std) - 0.5 * np.log(2 * np.pi)", "return -0.5 * r**2 - jnp.log(std)", "test_exact.py"),
+    Mutation("return -0.5 * r**2 - jnp.log(std) - HALF_LOG", "return -0.5 * r**2 - jnp.log(std)", "test_exact.py"),
     Mutation("(self.df + 1) / (self.df + 3)", "(self.df + 1) / (self.df + 2)", "test_methods.py"),
     Mutation("(self.df + 1) / (self.df * std**2", "(self.df + 3) / (self.df * std**2", "test_methods.py"),
     Mutation("xp.log(self.share) + density", "density", "test_methods.py"),
@@ -242,7 +242,7 @@ MUTATIONS = [
     Mutation("np.eye(q) + np.ones((q, q))", "np.eye(q)", "test_assess.py"),
     Mutation("expected = np.maximum(whole - used, 1e-9)", "expected = np.maximum(whole, 1e-9)", "test_assess.py"),
     Mutation("u**2 + variance - 1.0", "u**2 - 1.0", "test_asked_levels.py"),
-    Mutation("change: np.ndarray = steps[1][: len(steps[0])] - steps[0]", "change: np.ndarray = 0.0 * steps[1]", "test_asked_levels.py"),
+    Mutation("return steps[1][: len(steps[0])] - steps[0]", "return 0.0 * steps[1]", "test_asked_levels.py"),
     Mutation("and again.sum() < TOGETHER * count", "", "test_asked_levels.py"),
     Mutation("slice(row, row + size), slice(row, row + width))) row += size", "slice(row, row + size), slice(row, row + width)))\n        row += width", "test_tails.py"),
     Mutation("* (n + 2) / n", "* n / (n + 2)", "test_assess.py"),

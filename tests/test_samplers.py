@@ -306,7 +306,7 @@ def test_what_a_spike_keeps_out_has_no_part_in_a_swing(monkeypatch):
 
     monkeypatch.setattr(jax.random, "normal", pushed)
     chain = CollapsedState(theta, eps, phi, weight, jax.random.key(1))
-    move = jax.jit(lambda key: hmc_step(form, posed, chain, given, key))
+    move = jax.jit(lambda key: hmc_step(posed, chain, given, key))
     ends = [move(jax.random.key(k)) for k in range(5)]
     assert all((np.asarray(end[0])[out] == 0).all() for end in ends)
     moved = [not np.array_equal(end[1][0], eps[0]) for end in ends]

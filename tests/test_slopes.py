@@ -13,7 +13,7 @@ import probcal
 from probcal import Bias, Channel, ConstantVelocity, Network, Node, Problem, Unknown, sensor
 from probcal.analysis.check import Case
 from probcal.analysis.pieces import contrast
-from probcal.analysis.slopes import SHAPES, TOLD, _Looked
+from probcal.analysis.slopes import SAID, TOLD, _Looked
 from probcal.geometry import bearing, elevation, norm
 from probcal.inference.fitted import take_up
 from probcal.simulate import as_key, derived_keys
@@ -71,7 +71,7 @@ def said(tree, kind):
 @pytest.fixture
 def looked(monkeypatch):
     """The shapes of a world's fit, of few data too."""
-    monkeypatch.setattr("probcal.analysis.slopes.FEWEST", 3)
+    monkeypatch.setattr("probcal.analysis.regressors.FEWEST", 3)
 
     def of(name):
         problem, _ = worlds.linear(name)
@@ -86,19 +86,20 @@ def looked(monkeypatch):
 def test_a_shape_is_tested_as_in_a_dense_joint_posterior(name, looked):
     own = looked(name)
     M, compared = own.fit.problem.model.biases, 0
-    for packed in own.packed(own.shapes, own.along.shape[1]):
-        beside = own.beside(*packed, own.along)
-        naive = reference.NaiveEngine().at(beside.at.model, beside.at.point, beside.at.rows)
+    for part in {(shape.name, shared) for shape, shared in own.shapes.items()}:
+        wider = own.widened([shape for shape, shared in own.shapes.items() if (shape.name, shared) == part])
+        naive = reference.NaiveEngine().at(wider.at.model, wider.at.point, wider.at.rows)
         whole, slope = np.asarray(naive.information()), np.asarray(naive.slope())
         prior = np.diag(np.minimum(own.fit.factors.diagonal(M), 1.0))
         known = np.linalg.inv(whole[:M, :M] + prior)
-        tested = own.tests(beside)
-        for k, members in enumerate(beside.members):
+        tested = own.tests(wider)
+        for k, members in enumerate(wider.members):
             mine = members[members < len(whole)]
             cross = whole[np.ix_(mine, np.arange(M))]
             information = whole[np.ix_(mine, mine)] - cross @ known @ cross.T
             score = slope[mine] - cross @ known @ (slope[:M] - prior @ own.fit.point.z)
-            expected = contrast(information, score, max(TOLD * beside.alone[mine[0]], 1e-6))
+            size = np.sqrt(wider.alone[mine])
+            expected = contrast(information / np.outer(size, size), score / size, TOLD) if size.all() else None
             if expected is not None:
                 np.testing.assert_allclose(tested[k].square, expected.square, rtol=1e-4, atol=1e-6)
                 compared += 1
@@ -107,10 +108,10 @@ def test_a_shape_is_tested_as_in_a_dense_joint_posterior(name, looked):
 
 @float64
 def test_every_shape_is_tried_where_it_can_be(looked):
-    found = {(shape.name, len(shape.channels) > 2) for shape in looked("space").shapes}
-    assert {name for name, _ in found} == set(SHAPES)
+    found = {(shape.name, shared) for shape, shared in looked("space").shapes.items()}
+    assert {name for name, _ in found} == set(SAID)
     assert {shared for _, shared in found} == {True, False}
-    assert {shape.name for shape in looked("plane").shapes} == set(SHAPES) - {"elevation"}
+    assert {shape.name for shape in looked("plane").shapes} == set(SAID) - {"elevation"}
 
 
 def test_a_deviation_curve_is_named_and_what_is_advised_mends_it():
@@ -124,7 +125,7 @@ def test_a_deviation_curve_is_named_and_what_is_advised_mends_it():
         assert not said(tree, silent), silent
     assert set(tree["verdict"]["verdict"].values.tolist()) >= {"weak"}
     formula, unit, size = re.search(
-        r'add (.*) to finder, a = bearing\(.*\), .* north=Bias\("(.*)", (.*)\)', text
+        r'add (.*) to finder, a = probcal.geometry.bearing\(.*\), .* north=Bias\("(.*)", (.*)\)', text
     ).groups()
     kind = finder(formula, east=Bias(unit, float(size)), north=Bias(unit, float(size)))
     problem, tree = checked(table, kind)

@@ -15,14 +15,15 @@ import xarray as xr
 
 from probcal import linalg
 from probcal.analysis.standpoint import draw_states, on_tracks_of, true_biases, true_point
-from probcal.errors import InputError, nearest
+from probcal.errors import InputError, check_known
 from probcal.gaussian.choose import choose
 from probcal.gaussian.engine import Expansion, Factors, told_alone
 from probcal.gaussian.mode import Point
 from probcal.labels import NOBODY, listed
 from probcal.linalg import spectrum
 from probcal.model.model import At, Model
-from probcal.model.rows import Linearised
+from probcal.model.rows import Linearised, LinearRows
+from probcal.model.trajectories import States
 from probcal.problem import Problem
 from probcal.results.groups import along, bias_coords, by_target, node_of
 from probcal.simulate import Key, Truth, as_key
@@ -61,8 +62,7 @@ def bounds(
     >>> bounds(problem)["bias"]["sd"].sizes["bias_label"]
     12
     """
-    if kind not in KINDS:
-        raise InputError(f'bounds: kind is "{kind}"{nearest(kind, KINDS)}')
+    check_known(kind, KINDS, f'bounds: kind is "{kind}"')
     if draws < 1:
         raise InputError(f"bounds: draws={draws}; take at least one")
     given = Truth() if truth is None else truth
@@ -79,14 +79,24 @@ def bounds(
     alone = told_alone(at) + prior
     information = at.information()
     if information is None:
-        variance, bounded, spread = _by_ridge(at, prior, alone)
+        # variance (M,) of the biases, who is bounded (M,), and variances (E, n) of the states
+        ridge = LOST * np.where(alone > 0, alone, 1.0) * (prior == 0)
+        try:
+            found = at.spread(Factors.alone(prior + ridge))
+            loose = at.spread(Factors.alone(prior + 10.0 * ridge)) if ridge.any() else found
+        except np.linalg.LinAlgError:
+            raise InputError(
+                "bounds: rounding hides which biases of so many have none; survey or fix some of those that"
+                ' observability names, or take kind="posterior"'
+            ) from None
+        variance, bounded, spread = found.biases, found.biases < FOLLOWS * loose.biases, found.states
         return _tree(problem, kind, len(z), np.sqrt(variance), None, bounded, spread)
     root, bounded = _bounded_root(information + np.diag(prior), alone)
     covariance = root @ root.T
     return _tree(problem, kind, len(z), np.sqrt(np.diagonal(covariance)), covariance, bounded, at.followed(root))
 
 
-def _averaged(model: Model, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...]) -> Expansion:
+def _averaged(model: Model, levels: jax.Array, z: jax.Array, states: States) -> Expansion:
     """The information of all rows, averaged over points z (D, M) and states (D, E, n), and the trajectories."""
     rows = _average(model, levels, z, states)
     if not all(bool(np.isfinite(leaf).all()) for leaf in jax.tree.leaves(rows)):
@@ -96,18 +106,18 @@ def _averaged(model: Model, levels: jax.Array, z: jax.Array, states: tuple[jax.A
 
 
 @jax.jit
-def _average(model: Model, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...]) -> tuple[Linearised, ...]:
+def _average(model: Model, levels: jax.Array, z: jax.Array, states: States) -> LinearRows:
     """Rows of the expected information, averaged over points z (D, M) and states (D, E, n), without scores.
 
     The average of H'WH of a row is the information of as many data as the row reads states and biases.
     """
 
-    def at(z_d: jax.Array, states_d: tuple[jax.Array, ...]) -> list[jax.Array]:
+    def at(z_d: jax.Array, states_d: States) -> list[jax.Array]:
         lins = model.linearise(At(states_d, z_d, levels), expected=True)
         both = [(jnp.concatenate([lin.state, lin.bias], 2), lin.weight) for lin in lins]
         return [jnp.einsum("ncv,nc,ncw->nvw", H, weight, H) for H, weight in both]
 
-    def add(total: list[jax.Array], point: tuple[jax.Array, tuple[jax.Array, ...]]) -> tuple[list[jax.Array], None]:
+    def add(total: list[jax.Array], point: tuple[jax.Array, States]) -> tuple[list[jax.Array], None]:
         return jax.tree.map(jnp.add, total, at(*point)), None
 
     shapes = jax.eval_shape(at, z[0], tuple(x[0] for x in states))
@@ -119,29 +129,9 @@ def _rooted(information: jax.Array, used: int) -> Linearised:
     """Data of weight one that have the information (N, v, v), about `used` states and then biases."""
     size = jnp.sqrt(jnp.diagonal(information, axis1=1, axis2=2))
     size = jnp.where(size == 0, 1.0, size)
-    values, vectors = linalg.spectrum(information / (size[:, :, None] * size[:, None, :]))
+    values, vectors = linalg.spectrum(information / linalg.outer(size))
     root = jnp.sqrt(jnp.maximum(values, 0.0))[:, :, None] * vectors.mT * size[:, None, :]
     return Linearised(jnp.zeros_like(size), jnp.ones_like(size), root[:, :, :used], root[:, :, used:])
-
-
-def _by_ridge(
-    at: Expansion, prior: np.ndarray, alone: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
-    """Variance (M,) of the biases, who is bounded (M,), and variances (E, n) of the states.
-
-    A share `LOST` of the information `alone` (M,) is added where there is no prior. A bias whose variance follows when
-    ten times that is added has no bound.
-    """
-    ridge = LOST * np.where(alone > 0, alone, 1.0) * (prior == 0)
-    try:
-        found = at.spread(Factors.alone(prior + ridge))
-        loose = at.spread(Factors.alone(prior + 10.0 * ridge)) if ridge.any() else found
-    except np.linalg.LinAlgError:
-        raise InputError(
-            "bounds: rounding hides which biases of so many have none; survey or fix some of those that"
-            ' observability names, or take kind="posterior"'
-        ) from None
-    return found.biases, found.biases < FOLLOWS * loose.biases, found.states
 
 
 def _bounded_root(information: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -86,11 +86,10 @@ def changes(first: xr.DataTree, second: xr.DataTree, *, names: Sequence[str] = (
     for name, tree in pair.items():
         _check(name, tree)
     _check_zero(pair)
-    every = set(
-        first["calibration"].to_dataset()["bias_label"].values.tolist()
-    )  # of a drifting bias the first piece stays
+    every = set(listed_in(first, "calibration", "bias_label"))  # of a drifting bias the first piece stays
     labels = [label for label in common_labels(pair, "changes") if step_of(label, every) is None]
-    if _same_data(first, second):
+    one, two = (tree["observed_data"].to_dataset() for tree in (first, second))
+    if all(np.array_equal(one[name].values, two[name].values) for name in ("y", "time", "sensor")):
         raise InputError("changes: both fits are of the same data; compare() puts methods side by side")
     said = [Likelihood.of(tree).about(labels) for tree in pair.values()]
     group = first["calibration"].to_dataset().sel(bias_label=labels)
@@ -133,7 +132,7 @@ def _check_zero(pair: dict[str, xr.DataTree]) -> None:
             values = f'{a:.10g} in "{one}" and {b:.10g} in "{two}"'
             raise InputError(f"changes: {what} is stated as {values}; state the same values in both")
     held = [held_biases(first), held_biases(second)]
-    free = [set(tree["calibration"].to_dataset()["bias_label"].values.tolist()) for tree in pair.values()]
+    free = [set(listed_in(tree, "calibration", "bias_label")) for tree in pair.values()]
     for k, name in enumerate(pair):
         for label, value in held[k].items():
             if label in free[1 - k] or not np.isclose(held[1 - k].get(label, value), value):
@@ -145,11 +144,6 @@ def _stated(tree: xr.DataTree) -> dict[str, float]:
     moving = tree["constant_data"].to_dataset()["moving"].to_series()
     values = stated_values(tree)
     return {label: value for label, value in values.items() if not moving[label_parts(label)[0]]}
-
-
-def _same_data(first: xr.DataTree, second: xr.DataTree) -> bool:
-    one, two = (tree["observed_data"].to_dataset() for tree in (first, second))
-    return all(np.array_equal(one[name].values, two[name].values) for name in ("y", "time", "sensor"))
 
 
 def _changes(said: Sequence[Likelihood], scale: np.ndarray) -> dict[str, np.ndarray]:

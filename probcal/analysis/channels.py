@@ -1,7 +1,5 @@
 """Innovations and replicas of every channel of every sensor."""
 
-from typing import Any
-
 import numpy as np
 import xarray as xr
 from scipy import special
@@ -26,7 +24,7 @@ def check_channels(case: Case) -> Checked:
     """
     found, channels, replicas = case.innovations, case.channels, case.replicas
     findings, names, count = list[Finding](), channels.names, len(channels.names)
-    values: dict[str, Any] = residuals.squares(found, channels.group, count, RATE / count)._asdict()
+    values = residuals.squares(found, channels.group, count, RATE / count)._asdict()
     for name, mine, mean in zip(names, channels.members, channels.mean, strict=True):
         limit = -special.ndtri(RATE / (2 * count)) / np.sqrt(len(mine))
         if residuals.enough(found.kurtosis[mine]) and abs(mean) > max(limit, NOTABLE):

@@ -64,7 +64,7 @@ class Case:
         return {}
 
     def once(self, of: Callable[[Case], Any]) -> Any:
-        """What a function finds of this case, for all checks that ask."""
+        """The result of a function of this case, worked out once for all checks."""
         if of not in self._known:
             self._known[of] = of(self)
         return self._known[of]

@@ -12,10 +12,10 @@ from probcal.analysis.choices import check_count, check_names, split_pair
 from probcal.analysis.differences import findings
 from probcal.analysis.findings import Finding, finding_group
 from probcal.analysis.overlap import Marginal, of_draws, of_gaussian, overlap, wasserstein
-from probcal.errors import InputError, checked, nearest
+from probcal.errors import InputError, check_known, checked
 from probcal.labels import label_parts
 from probcal.results.groups import along
-from probcal.results.read import known_truth
+from probcal.results.read import known_truth, listed_in
 from probcal.results.schema import EVIDENCES
 from probcal.results.scores import judged_by, rms
 from probcal.status import INVALID
@@ -54,7 +54,13 @@ def compare(fits: Fits, names: Sequence[str] | None = None) -> xr.DataTree:
     known = fits_by_name(fits, names)
     labels = common_labels(known)
     order = loo.same_data(known)
-    groups: dict[str, xr.Dataset] = {"estimate": _estimates(known, labels), "pair": _pairs(known, labels)}
+    tables = [tree["calibration"].to_dataset().sel(bias_label=labels) for tree in known.values()]
+    columns = {name: (("estimator", "bias_label"), np.stack([g[name].values for g in tables])) for name in COLUMNS}
+    coords = {name: ("bias_label", tables[0][name].values) for name in ("unit", "scale")}
+    groups = {
+        "estimate": xr.Dataset(columns, {"estimator": list(known), "bias_label": labels, **coords}),
+        "pair": _pairs(known, labels),
+    }
     truth = _truth(known, labels)
     if len(truth):
         groups["truth"] = xr.Dataset({"bias": ("bias_label", list(truth.values()))}, {"bias_label": list(truth)})
@@ -138,8 +144,7 @@ def chosen_pair(fits: Mapping[str, xr.DataTree], labels: Sequence[str]) -> tuple
     common = common_labels(fits)
     pair = split_pair(labels)
     for label in pair:
-        if label not in common:
-            raise InputError(f'the pair names "{label}", which is no bias of all the fits{nearest(label, common)}')
+        check_known(label, common, f'the pair names "{label}", which is no bias of all the fits')
     return pair
 
 
@@ -166,13 +171,6 @@ def common_labels(fits: Mapping[str, xr.DataTree], verb: str = "compare") -> lis
     return labels
 
 
-def _estimates(fits: Mapping[str, xr.DataTree], labels: list[str]) -> xr.Dataset:
-    groups = [tree["calibration"].to_dataset().sel(bias_label=labels) for tree in fits.values()]
-    columns = {name: (("estimator", "bias_label"), np.stack([g[name].values for g in groups])) for name in COLUMNS}
-    coords = {name: ("bias_label", groups[0][name].values) for name in ("unit", "scale")}
-    return xr.Dataset(columns, {"estimator": list(fits), "bias_label": labels, **coords})
-
-
 def _marginals(tree: xr.DataTree, labels: list[str]) -> list[Marginal]:
     """Posterior of each bias in scales."""
     group = tree["calibration"].to_dataset().sel(bias_label=labels)
@@ -187,7 +185,7 @@ def _marginals(tree: xr.DataTree, labels: list[str]) -> list[Marginal]:
 def _pairs(fits: Mapping[str, xr.DataTree], labels: list[str]) -> xr.Dataset:
     marginals = {name: _marginals(tree, labels) for name, tree in fits.items()}
     pairs = list(combinations(fits, 2))
-    columns: dict[str, Any] = {
+    columns = {
         measure.__name__: (
             ("pair", "bias_label"),
             [[measure(*own) for own in zip(marginals[a], marginals[b], strict=True)] for a, b in pairs],
@@ -246,7 +244,7 @@ def _scores(tree: xr.DataTree, truth: Mapping[str, float]) -> dict[str, Any]:
     if not truth:
         return {}
     known = judged_by(tree, truth)
-    found: dict[str, Any] = {"bias_rmse": rms(known["error"])}
+    found = {"bias_rmse": rms(known["error"])}
     for suffix, own in (("", known["inside"]), ("_nonzero", known["inside"][known["true"] != 0])):
         if len(own):
             count = {f"covered{suffix}": int(own.sum()), f"known{suffix}": len(own)}
@@ -258,7 +256,7 @@ def _left_out(fits: Mapping[str, xr.DataTree], labels: list[str]) -> list[Findin
     """Findings on the biases that not all fits have."""
     texts = list[str]()
     for name, tree in fits.items():
-        own = [label for label in tree["calibration"].to_dataset()["bias_label"].values.tolist() if label not in labels]
+        own = [label for label in listed_in(tree, "calibration", "bias_label") if label not in labels]
         if own:
             texts.append(f"{len(own)} of {name} ({own[0]}{', ...' if len(own) > 1 else ''})")
     said = f"biases that not all fits have are not compared: {', '.join(texts)}"

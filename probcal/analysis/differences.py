@@ -13,22 +13,20 @@ import xarray as xr
 from probcal.analysis.findings import NAMES, Finding
 from probcal.analysis.loo import BAD
 from probcal.analysis.overlap import ZERO
+from probcal.inference.mixed import R_HAT
 from probcal.labels import listed
+from probcal.results.read import listed_in
 from probcal.results.schema import EVIDENCES
 from probcal.status import INVALID, Status
 
 NARROW = 0.7  # ratio of sds beyond which, either way, a method is not enough
 GAMMA = 0.05  # by which a gamma must lie above the interval of the reference's to be a finding
 CERTAIN = 4.0  # nats of elpd below which a difference is none, whatever its error
-MIXED = 1.01  # r_hat above which chains disagree
 
 
 def findings(comparison: xr.DataTree) -> list[Finding]:
     """Sentences on a comparison, those that put it in question first."""
-    names, reference = (
-        comparison["estimate"].to_dataset()["estimator"].values.tolist(),
-        str(comparison.attrs["reference"]),
-    )
+    names, reference = listed_in(comparison, "estimate", "estimator"), str(comparison.attrs["reference"])
     methods = {name: comparison[f"method/{name}"].to_dataset() for name in names}
     found = [finding for name in names for finding in _doubts(name, methods[name])]
     for name in names:
@@ -41,7 +39,7 @@ def _doubts(name: str, method: xr.Dataset) -> list[Finding]:
     status, found = Status(method.attrs["status"]), list[Finding]()
     if not status.settled:
         found.append(Finding("status", name, f"{name} {status.said}"))
-    if method.attrs.get("largest_r_hat", 1.0) > MIXED:
+    if method.attrs.get("largest_r_hat", 1.0) > R_HAT:
         label = method["bias_label"].values[int(np.argmax(method["r_hat"].values))]
         text = f"{name}: r_hat of {label} is {method.attrs['largest_r_hat']:.3f}, its chains disagree; draw more"
         found.append(Finding("sampling", name, text))

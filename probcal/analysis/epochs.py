@@ -33,25 +33,22 @@ def check_epochs(case: Case) -> Checked:
     groups = {f"epoch_check/{name}": group for name, group in by_target(fit.problem, columns, kept=kept).items()}
     groups = {"epoch_check": xr.Dataset()} | groups
     if case.truth is not None:
-        _score(case, case.truth, groups)
+        # add the errors; positions are judged by draws of their tracks, where there are some
+        tracked = dict(each_target(case.tree))
+        case.truth.check_targets(tracked)
+        for r, draws in enumerate(case.drawn.states if "draws" in case.has else ()):
+            own = case.fit.problem.epochs[r]
+            for target in (name for name in tracked if name in own.target):
+                states = np.asarray(draws)[:, own.target == target]
+                errors = nees.of_positions(target, tracked[target], states, case.truth)
+                if errors is not None:
+                    name = f"epoch_check/{node_of(target)}"
+                    check = groups[name].assign_coords(nees_time=tracked[target]["time"].values[errors.known])
+                    groups[name] = check.assign(nees=("nees_time", errors.value))
+                    attrs = {"nees": errors.mean, "nees_lower": errors.lower, "nees_upper": errors.upper}
+                    groups[name].attrs |= attrs
+        biases = nees.of_biases(case.tree, case.truth) if case.fit.whole else nees.of_all_biases(case.fit, case.truth)
+        if biases is not None:
+            names = ("nees_bias", "nees_bias_count", "nees_bias_lower", "nees_bias_upper")
+            groups["epoch_check"].attrs |= dict(zip(names, biases, strict=True))
     return Checked(groups)
-
-
-def _score(case: Case, truth: nees.Truth, groups: dict[str, xr.Dataset]) -> None:
-    """Add the errors; positions are judged by draws of their tracks, where there are some."""
-    tracked = dict(each_target(case.tree))
-    truth.check_targets(tracked)
-    for r, draws in enumerate(case.drawn.states if "draws" in case.has else ()):
-        own = case.fit.problem.epochs[r]
-        for target in (name for name in tracked if name in own.target):
-            states = np.asarray(draws)[:, own.target == target]
-            found = nees.of_positions(target, tracked[target], states, truth)
-            if found is not None:
-                name = f"epoch_check/{node_of(target)}"
-                check = groups[name].assign_coords(nees_time=tracked[target]["time"].values[found.known])
-                groups[name] = check.assign(nees=("nees_time", found.value))
-                groups[name].attrs |= {"nees": found.mean, "nees_lower": found.lower, "nees_upper": found.upper}
-    biases = nees.of_biases(case.tree, truth) if case.fit.whole else nees.of_all_biases(case.fit, truth)
-    if biases is not None:
-        names = ("nees_bias", "nees_bias_count", "nees_bias_lower", "nees_bias_upper")
-        groups["epoch_check"].attrs |= dict(zip(names, biases, strict=True))

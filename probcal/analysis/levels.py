@@ -20,7 +20,7 @@ import xarray as xr
 from probcal.analysis.check import Case, Checked, check
 from probcal.analysis.findings import Finding
 from probcal.analysis.verdict import limit_of
-from probcal.gaussian.engine import Engine, Expansion, Factors, noise_information, noise_score
+from probcal.gaussian.engine import Engine, Expansion, Factors, noise_score, noise_terms
 from probcal.inference.fitted import Judged
 from probcal.inference.residuals import PRACTICAL
 from probcal.labels import listed
@@ -199,7 +199,13 @@ def ask(fit: Judged, members: Members, factors: Factors) -> Wanted | None:
     """
     if fit.engine.cheap:
         return _followed(fit, members, factors)
-    look = _screened(fit.expansion, factors, members)
+    # the levels by one look, and which of them may be wrong: those to linearise again
+    slope, alone = (members.sums(*own) for own in noise_terms(fit.expansion, factors))
+    alone = np.maximum(alone, 1e-300)
+    step, sd = slope / alone, alone**-0.5
+    suspect = (np.abs(step) > NEAR) | (step**2 > SUSPECT * sd**2)
+    shift = np.full((len(step), fit.expansion.model.biases), np.nan)
+    look = Wanted(step, sd, (step / sd) ** 2, shift, suspect)
     if not look.linearised.any():
         return look
     asked = _followed(fit, members.only(look.linearised), factors)
@@ -232,15 +238,6 @@ def _followed(fit: Judged, members: Members, factors: Factors) -> Wanted | None:
             break
         at = _at(fit.engine, at, members, own, own @ follow)
     return Wanted(step, sd, square, shift, every)
-
-
-def _screened(at: Expansion, factors: Factors, members: Members) -> Wanted:
-    """The levels by one look, and which of them may be wrong: those to linearise again."""
-    alone = np.maximum(members.sums(*noise_information(at, factors)), 1e-300)
-    step, sd = members.sums(*noise_score(at, factors)) / alone, alone**-0.5
-    suspect = (np.abs(step) > NEAR) | (step**2 > SUSPECT * sd**2)
-    shift = np.full((len(step), at.model.biases), np.nan)
-    return Wanted(step, sd, (step / sd) ** 2, shift, suspect)
 
 
 @check("answer", "factor")

@@ -66,7 +66,7 @@ def bound_map(
     at = snapshot(problem, target, time)
     M = len(at.labels)
     mean, levels = np.zeros(M), np.zeros(len(at.levels))
-    spread: SensorBlocks | None = None
+    spread = None
     if isinstance(biases, xr.DataTree):
         if not {"calibration", "constant_data"} <= set(biases.children):
             raise InputError("bound_map: the tree of biases has no group calibration; give the result of fit()")

@@ -6,7 +6,7 @@ from probcal.analysis.check import Case, Checked, check
 from probcal.identifiability.directions import combination
 from probcal.identifiability.patterns import cause
 from probcal.identifiability.remedies import WEAK
-from probcal.linalg import spectrum
+from probcal.linalg import outer, spectrum
 
 SHARED = 1.8  # sd that an open combination of one scale may put a bias off; of four with a free common part, about 1.9
 
@@ -29,7 +29,7 @@ def check_open(case: Case) -> Checked:
         information = group["information"].values[None]
     else:
         free = np.append(~problem.surveyed, False)[blocks.members]
-        known = np.where(free[:, :, None] & free[:, None, :], known, 0.0)
+        known = np.where(outer(free), known, 0.0)
         values, vectors = spectrum(known)
         information = 1.0 / np.maximum(values, 1e-300) - 1.0
     sd = np.sqrt(np.maximum(np.diagonal(known, axis1=1, axis2=2), 1e-300))[:, :, None]

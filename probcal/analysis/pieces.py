@@ -205,8 +205,7 @@ def _together(
 def freed(pieces: Pieces, free: Sequence[tuple[int, np.ndarray]]) -> np.ndarray:
     """Change (M,) of what all pieces have in common, in z, where the biases in `free` differ along their patterns."""
     steps = [inverse @ slope for _, _, inverse, slope in (_together(pieces, own) for own in ((), free))]
-    change: np.ndarray = steps[1][: len(steps[0])] - steps[0]
-    return change
+    return steps[1][: len(steps[0])] - steps[0]
 
 
 class Change(NamedTuple):

@@ -12,9 +12,10 @@ import xarray as xr
 from probcal.analysis.additions import Informed, gains_of_sensors, informations_of_passes
 from probcal.errors import InputError
 from probcal.gaussian.mode import Point
+from probcal.geometry import lattice
 from probcal.identifiability.remedies import WEAK
 from probcal.labels import AXES, NOBODY
-from probcal.linalg import eigenvalues, invert, log_determinant
+from probcal.linalg import eigenvalues, invert, log_determinant, outer
 from probcal.problem import Epochs, Problem
 from probcal.simulate import Truth
 from probcal.types import float64
@@ -49,7 +50,7 @@ def next_passes(
         shape = f"(passes, points, {problem.network.dimension})"
         raise InputError(f"passes has shape {np.shape(passes)}; give {shape} of finite numbers")
     known, found = told.information, {"gain": np.zeros(len(paths))}
-    attrs: dict[str, Any] = {"pattern": name, "reach": max(told.reach.values(), default=0.0)}
+    attrs = {"pattern": name, "reach": max(told.reach.values(), default=0.0)}
     if known is not None:
         attrs["weak_before"] = _weak(problem, known)
         found["weak"] = np.full(len(paths), attrs["weak_before"])
@@ -88,7 +89,7 @@ def next_anchors(
     M, width = len(problem.labels), max(map(len, anchors.values()))
     members = np.array([[*group, *[M] * (width - len(group))] for group in anchors.values()])
     there, eye = members < M, np.eye(width)
-    pairs = there[:, :, None] & there[:, None, :]
+    pairs = outer(there)
     covariance = np.where(pairs, told.at.marginals(told.scales, members), 0.0)
     own = 0.5 * log_determinant(eye + covariance / survey**2)
     gain = np.full(len(own), -np.inf)
@@ -235,7 +236,7 @@ def _grid(problem: Problem, point: Point) -> np.ndarray:
     """Places (P, d) on a grid over the area."""
     low, high = _area(problem, point)
     axes = [np.linspace(a, b, GRID) for a, b in zip(low[:2], high[:2], strict=True)]
-    flat = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+    flat = lattice(axes)
     return np.concatenate([flat, np.broadcast_to(low[2:], (len(flat), len(low) - 2))], 1)
 
 

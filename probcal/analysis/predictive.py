@@ -16,9 +16,10 @@ import xarray as xr
 from probcal.gaussian.draws import draw
 from probcal.inference.fitted import Judged
 from probcal.inference.residuals import all_gaussian, exact_kurtosis
-from probcal.model.model import At, Model
+from probcal.model.model import At, Data, Model
 from probcal.model.motions import level_logs
 from probcal.model.rows import standardised
+from probcal.model.trajectories import States
 from probcal.results.read import each_track, saved_states
 
 DRAWS = 400
@@ -31,7 +32,7 @@ class FitDraws(NamedTuple):
 
     z: jax.Array
     levels: jax.Array
-    states: tuple[jax.Array, ...]
+    states: States
     replicas: Sequence[jax.Array] | None
 
 
@@ -49,7 +50,7 @@ class Predictive(NamedTuple):
 
 @partial(jax.jit, static_argnames="count")
 def _discrepancies(
-    model: Model, levels: jax.Array, drawn: FitDraws, sensors: tuple[jax.Array, ...], count: int,
+    model: Model, levels: jax.Array, drawn: FitDraws, sensors: Data, count: int,
     key: jax.Array,
 ) -> tuple[list[jax.Array], list[jax.Array]]:  # fmt: skip
     """By draw, data or replica, sensor and channel (D, 2, 2, S, C): -log p and sum of scores; fourth powers (N, C)."""
@@ -118,10 +119,5 @@ def draws_of(fit: Judged, tree: xr.DataTree, key: jax.Array) -> FitDraws:
     replicas = tree["posterior_predictive"].to_dataset()["y"] if "posterior_predictive" in tree.children else None
     if replicas is None or replicas.sizes["draw"] < posterior.sizes["draw"]:
         return FitDraws(z, levels, states, None)
-    flat, blocks, start = thin(replicas.values), [], 0
-    for there, (row, channel) in zip(problem.model.measured, fit.picks, strict=True):
-        block = np.zeros((most, *there.shape))
-        block[:, row, channel] = flat[:, start : start + len(row)]
-        blocks.append(jnp.asarray(block))
-        start += len(row)
-    return FitDraws(z, levels, states, blocks)
+    blocks = fit.in_blocks(thin(replicas.values).T)
+    return FitDraws(z, levels, states, [jnp.moveaxis(own, -1, 0) for own in blocks])

@@ -70,14 +70,12 @@ def _unlike(component: Any, noises: np.ndarray, replicas: np.ndarray) -> str:
 def _kurtosis(noises: np.ndarray) -> np.ndarray:
     """Mean fourth power over the squared mean square, of (epochs, entries, ...)."""
     there = np.maximum((noises != 0).sum((0, 1)), 1)
-    value: np.ndarray = (noises**4).sum((0, 1)) / there / np.maximum((noises**2).sum((0, 1)) / there, 1e-300) ** 2
-    return value
+    return (noises**4).sum((0, 1)) / there / np.maximum((noises**2).sum((0, 1)) / there, 1e-300) ** 2
 
 
 def _correlation(noises: np.ndarray, lag: int) -> np.ndarray:
     """Correlation of noises (epochs, entries, ...) some epochs apart."""
-    value: np.ndarray = (noises[lag:] * noises[:-lag]).sum((0, 1)) / np.maximum((noises**2).sum((0, 1)), 1e-300)
-    return value
+    return (noises[lag:] * noises[:-lag]).sum((0, 1)) / np.maximum((noises**2).sum((0, 1)), 1e-300)
 
 
 def _compared(value: np.ndarray, replicas: np.ndarray) -> tuple[float, float, float]:

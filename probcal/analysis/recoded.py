@@ -6,34 +6,25 @@ convention counts them, and the joint mode is looked for again.
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import NamedTuple
 
 import numpy as np
 
 from probcal.analysis.check import Case, Checked, check
 from probcal.analysis.findings import Finding
+from probcal.analysis.parts import LOOKED
 from probcal.gaussian.engine import Expansion
 from probcal.inference.fitted import Judged
+from probcal.inference.residuals import PRACTICAL
 from probcal.model.rows import standardised
 from probcal.modes import optima
 from probcal.sensor import Channel
 
 FAR = 5.0  # mean square of the innovations from which readings are looked at
-FITS = 2.0  # mean square of what a fit leaves up to which another way explains the readings
-WORST = 4  # sensors of a type that are looked at one by one
 LONGEST = 20.0  # s after which no other way is tried
 # what else speaks of it
 SIGNS = ("levels", "process", "channels", "sensors", "rows", "slopes", "shape", "segments")
 
 Way = Callable[[np.ndarray], np.ndarray]
-
-
-class Turned(NamedTuple):
-    """Channels whose readings may be counted another way."""
-
-    name: str  # of a sensor, or of a type
-    channel: str
-    way: str
 
 
 def ways(channel: Channel, signed: bool) -> Mapping[str, Way]:
@@ -55,17 +46,17 @@ def check_recoded(case: Case) -> Checked:
     if not (case.fit.engine.cheap and linear) or case.innovations.spread(slice(None)) < FAR:
         return Checked()
     begun = time.monotonic()
-    for turned, values in _tried(case):
+    for name, said, values in _tried(case):
         if time.monotonic() - begun > LONGEST:
             break
         again = case.fit.problem.redrawn(values)
         square = _square(case.fit, case.fit.engine.at(again.model, optima(again, lambda: True)[0].point))
-        if square < FITS:
+        if square < PRACTICAL:
             text = (
-                f"{turned.name}.{turned.channel}: its values {turned.way}: counted so, the mean square of what a fit"
+                f"{name}: its values {said}: counted so, the mean square of what a fit"
                 f" leaves is {square:.2g} and not {_square(case.fit, case.fit.expansion):.2g}"
             )
-            return Checked(findings=[Finding("recoded", turned.name, text)], explains=SIGNS)
+            return Checked(findings=[Finding("recoded", name, text)], explains=SIGNS)
     return Checked()
 
 
@@ -74,15 +65,15 @@ def _square(fit: Judged, at: Expansion) -> float:
     return float(np.mean(fit.flat([standardised(lin.score, lin.weight) for lin in at.rows]) ** 2))
 
 
-def _tried(case: Case) -> Iterator[tuple[Turned, list[np.ndarray]]]:
-    """What may be counted another way, each way of a type and of its worst sensors, and the values (N, C) of each block
-    then."""
+def _tried(case: Case) -> Iterator[tuple[str, str, list[np.ndarray]]]:
+    """Channels and ways to count them, each way of a type and of its worst sensors, and the values (N, C) of each
+    block then."""
     problem, data = case.fit.problem, case.fit.data
     names = np.array([placed.name for placed in problem.network.sensors])
     squares = data.assign(square=case.innovations.value**2).groupby("sensor", sort=False)["square"].mean()
     for kind in problem.network.types:
         alike = tuple(placed.name for placed in problem.network.sensors if placed.type == kind)
-        worst = squares[squares.index.isin(alike)].sort_values(ascending=False).index[:WORST].astype(str)
+        worst = squares[squares.index.isin(alike)].sort_values(ascending=False).index[:LOOKED].astype(str)
         groups: dict[str, tuple[str, ...]] = ({kind.name: alike} if len(alike) > 1 else {}) | {
             own: (own,) for own in worst
         }
@@ -97,4 +88,4 @@ def _tried(case: Case) -> Iterator[tuple[Turned, list[np.ndarray]]]:
                         mine = np.isin(names[problem.measurements.sensor[index]], sensors) & (block.type == kind)
                         y[mine, c] = way(y[mine, c])
                         values.append(y)
-                    yield Turned(name, channel, said), values
+                    yield f"{name}.{channel}", said, values

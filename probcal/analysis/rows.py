@@ -1,7 +1,5 @@
 """Innovation of every datum, and PSIS-LOO of its row."""
 
-from typing import Any
-
 import xarray as xr
 
 from probcal.analysis import leave
@@ -16,7 +14,7 @@ from probcal.results.groups import along
 def check_rows(case: Case) -> Checked:
     """Innovation of every datum, and PSIS-LOO of its row where the tree holds the log-likelihood."""
     data, found, tree = case.fit.data, case.innovations, case.tree
-    values: dict[str, Any] = {"innovation": found.value}
+    values = {"innovation": found.value}
     used, texts = float(found.used.sum()), list[str]()
     attrs = {"nis": float((found.value**2).sum()) / max(len(data) - used, 1e-9), "used": used}
     if "log_likelihood_sum" in tree.children:

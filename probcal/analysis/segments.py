@@ -53,11 +53,10 @@ def check_segments(case: Case) -> Checked:
     if compared is None:
         return Checked()
     problem, inflation, changes = case.fit.problem, compared.inflation, compared.changes
-    M, slopes, explains = problem.model.biases, case.once(found_slopes), ["levels"]
+    M, slopes = problem.model.biases, case.once(found_slopes)
     if changes and slopes is not None:  # the stronger counts
         first = changes[0].square / limit_of(M, changes[0].contrast.freedom)
         changes = [] if slopes.ratio > first else changes
-        explains.append("slopes")
     limit, groups, findings = limit_of(M), {}, []
     if compared.alone:
         groups["halves"] = group_of(problem, compared, grid)
@@ -83,7 +82,7 @@ def check_segments(case: Case) -> Checked:
         text = "more biases may have changed and were not compared: so many are rarely drifts of single biases"
         findings.append(Finding("halves", "fit", f"{compared.unsolved} {text}"))
     doubts = {"drifting": drifts, "conflicting": disagreements, "weak": weak}
-    return Checked(groups, findings, doubts, explains if changes else [], inflation, remarks)
+    return Checked(groups, findings, doubts, ["levels", "slopes"] if changes else [], inflation, remarks)
 
 
 def compare_segments(

@@ -13,7 +13,9 @@ from probcal.analysis.standpoint import draw_states, on_tracks_of
 from probcal.errors import InputError, nearest
 from probcal.gaussian.choose import choose
 from probcal.gaussian.mode import Point, smooth_tracks
+from probcal.geometry import lattice
 from probcal.model.model import At, Model
+from probcal.model.trajectories import States
 from probcal.modes.grid import follow_states
 from probcal.problem import Problem
 from probcal.simulate import Key, Truth, as_key
@@ -47,7 +49,7 @@ def sensitivity(
     """
     values = {str(name): np.asarray(value, float) for name, value in stds.items()}
     units = _units(problem, values)
-    grid = np.stack(np.meshgrid(*values.values(), indexing="ij"), -1).reshape(-1, len(values))
+    grid = lattice(list(values.values()))
     if runs < 1:
         raise InputError(f"sensitivity: runs={runs}; take at least one")
     given = Truth() if truth is None else truth
@@ -59,7 +61,17 @@ def sensitivity(
     unit = jax.random.normal(keys[1], (runs, problem.model.biases))
     spread, seeds = jnp.asarray(grid @ units), jax.random.split(keys[2], runs)
     squares = np.asarray(_errors(problem.model, spans, spread, unit, true, start, seeds))
-    alone, gain = _first_order(problem, units, true)
+    # mean squared position error without biases, and by the square of the std of each pattern (P,)
+    model, engine, found = problem.model, choose(problem.model), list[list[float]]()
+    roots = [np.zeros((model.biases, 0)), *(np.diag(own)[:, own > 0] for own in units)]
+    for j in range(len(true[0])):
+        states = tuple(x[j] for x in true)
+        noises, levels = tuple(jnp.zeros_like(x) for x in states), jnp.zeros(model.level_spread.shape)
+        at = engine.at(model, Point(states, noises, jnp.zeros(model.biases), levels))
+        variances = (problem.positions(at.followed(root)) for root in roots)
+        found.append([sum(float(own.sum()) for own in each) for each in variances])
+    alone, *whole = np.mean(found, 0) / sum(x.shape[1] for x in true)
+    gain = np.array(whole) - alone
     shape = tuple(len(v) for v in values.values())
     predicted = alone + grid**2 @ gain
     dims = tuple(values)
@@ -97,7 +109,7 @@ def _errors(
     spans: Spans,
     spread: jax.Array,
     unit: jax.Array,
-    true: tuple[jax.Array, ...],
+    true: States,
     start: Point,
     keys: jax.Array,
 ) -> jax.Array:
@@ -116,17 +128,3 @@ def _errors(
     pairs = jnp.stack(jnp.meshgrid(jnp.arange(cells), jnp.arange(runs), indexing="ij"), -1).reshape(-1, 2)
     together = None if jax.default_backend() == "cpu" else BATCH
     return jax.lax.map(one, pairs, batch_size=together).reshape(cells, runs)
-
-
-def _first_order(problem: Problem, units: np.ndarray, true: Sequence[jax.Array]) -> tuple[float, np.ndarray]:
-    """Mean squared position error without biases, and by the square of the std of each pattern (P,)."""
-    model, engine, found = problem.model, choose(problem.model), list[list[float]]()
-    roots = [np.zeros((model.biases, 0)), *(np.diag(own)[:, own > 0] for own in units)]
-    for k in range(len(true[0])):
-        states = tuple(x[k] for x in true)
-        noises, levels = tuple(jnp.zeros_like(x) for x in states), jnp.zeros(model.level_spread.shape)
-        at = engine.at(model, Point(states, noises, jnp.zeros(model.biases), levels))
-        variances = (problem.positions(at.followed(root)) for root in roots)
-        found.append([sum(float(own.sum()) for own in each) for each in variances])
-    alone, *whole = np.mean(found, 0) / sum(x.shape[1] for x in true)
-    return alone, np.array(whole) - alone

@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal.errors import InputError, nearest
+from probcal.errors import InputError, check_known
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.choose import choose
 from probcal.gaussian.mode import Point, factors
+from probcal.model.trajectories import States
 from probcal.modes import automatic_start
 from probcal.modes.grid import grid_start, track_mode
 from probcal.problem import Problem, check_linear
@@ -39,14 +40,11 @@ def standpoint(problem: Problem, point: Point | None, truth: Truth | None) -> Po
 def true_biases(problem: Problem, truth: Truth) -> jax.Array:
     """True biases z (M,), 0 where the truth is silent."""
     for label in truth.biases:
-        if label not in problem.network.labels:
-            raise InputError(
-                f'the truth names the bias "{label}", which the network lacks{nearest(label, problem.network.labels)}'
-            )
+        check_known(label, problem.network.labels, f'the truth names the bias "{label}", which the network lacks')
     return jnp.asarray([truth.biases.get(b.label, 0.0) / b.scale for b in problem.biases], float)
 
 
-def true_point(problem: Problem, truth: Truth | None) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+def true_point(problem: Problem, truth: Truth | None) -> tuple[jax.Array, States]:
     """The point of a truth: z (1, M) and states (1, E, n); where it says nothing of a target, the automatic start."""
     given = Truth() if truth is None else truth
     z, states = true_biases(problem, given), draw_states(problem, 1, None)
@@ -64,7 +62,7 @@ def true_point(problem: Problem, truth: Truth | None) -> tuple[jax.Array, tuple[
     return z[None], on_tracks_of(problem, given, states)
 
 
-def draw_states(problem: Problem, count: int, key: jax.Array | None) -> tuple[jax.Array, ...]:
+def draw_states(problem: Problem, count: int, key: jax.Array | None) -> States:
     """Trajectories (D, E, n) of each recursion drawn from the motion, or its means where there is no key."""
     check_linear(problem)
     found = []
@@ -95,7 +93,7 @@ def true_states(problem: Problem, truth: Truth) -> list[np.ndarray]:
     return found
 
 
-def on_tracks_of(problem: Problem, truth: Truth, states: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
+def on_tracks_of(problem: Problem, truth: Truth, states: Sequence[jax.Array]) -> States:
     """Trajectories (D, E, n) with the true tracks put over them."""
     return tuple(
         jnp.where(np.isfinite(true)[None], np.nan_to_num(true)[None], x)

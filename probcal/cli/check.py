@@ -22,7 +22,7 @@ from probcal.gaussian.mode import Point
 from probcal.inference.progress import Monitor
 from probcal.labels import NOBODY
 from probcal.problem import Problem
-from probcal.results.read import frame_of
+from probcal.results.read import frame_of, listed_in
 
 Plans = tuple[xr.Dataset | None, xr.Dataset, xr.Dataset]
 LISTED = 12  # directions of many biases
@@ -125,7 +125,7 @@ def print_known(problem: Problem, tree: xr.DataTree) -> None:
 def _directions_text(tree: xr.DataTree) -> str:
     """The directions that the data leave open, in words, each with its remedy."""
     if "direction" not in tree.children:
-        surveyed = "survey" in tree["bias"].to_dataset()["kind"].values.tolist()
+        surveyed = "survey" in listed_in(tree, "bias", "kind")
         return f"the data determine every direction of the biases{' without a survey' if surveyed else ''}"
     frame = frame_of(tree, "direction", "kind", "share", "words", "remedy")
     count = max(len(frame), int(tree.attrs["weak"]))

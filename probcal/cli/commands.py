@@ -13,7 +13,7 @@ from probcal.analysis.choices import check_count, check_names, split_pair
 from probcal.cli import files, options, outputs
 from probcal.cli.arguments import Data, Fix, Given, Method, Model, Network, Overwrite, Prior, Scheduler, Seed
 from probcal.cli.names import METHODS
-from probcal.errors import FitError, InputError, nearest
+from probcal.errors import FitError, InputError, check_known
 from probcal.inference.progress import Terminated, check_limit
 
 app = typer.Typer(
@@ -116,8 +116,7 @@ def fit_command(
     Several recordings of one network are fitted each into a folder below --out, with one table of all, fits.csv.
     """
     wings.check_method_installed(method)
-    if method not in METHODS:
-        raise InputError(f'--method "{method}" is not known{nearest(method, METHODS)}')
+    check_known(method, METHODS, f'--method "{method}" is not known')
     options.check_priors(method, prior or ())
     sizes = options.chain_sizes(method, {"chains": chains, "draws": draws, "warmup": warmup})
     if resume and out is None:
@@ -199,8 +198,7 @@ def track_command(
     """Tracks of other data with a calibration applied: time, target, each state component with its sd."""
     if calibration is None:
         raise InputError("track needs --calibration DIR, the folder of a fit")
-    if smoother not in SMOOTHERS:
-        raise InputError(f'--smoother "{smoother}" is not known{nearest(smoother, SMOOTHERS)}')
+    check_known(smoother, SMOOTHERS, f'--smoother "{smoother}" is not known')
     options.check_fit(calibration)
     options.check_files(model, data)
     arguments = options.given(given or ())

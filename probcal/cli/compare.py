@@ -14,7 +14,7 @@ from probcal.cli.files import say_findings, write_result
 from probcal.diagnostics import comparison_rows
 from probcal.files import Outputs
 from probcal.results.io import load
-from probcal.results.read import known_truth
+from probcal.results.read import known_truth, listed_in
 from probcal.results.schema import EVIDENCES
 from probcal.status import INVALID
 
@@ -43,7 +43,7 @@ def estimates_text(comparison: xr.DataTree) -> str:
     estimate, pair = comparison["estimate"].to_dataset(), comparison["pair"].to_dataset()
     labels, names = estimate["bias_label"].values.tolist(), estimate["estimator"].values.tolist()
     first = names[0]
-    columns: list[tuple[str, list[str]]] = [("bias", labels), ("unit", estimate["unit"].values.tolist())]
+    columns = [("bias", labels), ("unit", estimate["unit"].values.tolist())]
     if len(true := known_truth(comparison)):
         columns.append(("true", [f"{true[label] + 0.0:.4g}" if label in true else "" for label in labels]))
     for name in names:
@@ -76,7 +76,7 @@ MEASURES = {
 def methods_text(comparison: xr.DataTree) -> str:
     """One row a method: status, scores, prediction, evidence and cost, a cell empty where it does not apply."""
     rows = []
-    for name in comparison["estimate"].to_dataset()["estimator"].values.tolist():
+    for name in listed_in(comparison, "estimate", "estimator"):
         at = comparison[f"method/{name}"].attrs
         row = {"method": name, "status": at["status"], "bias_rmse": _measure(at, "bias_rmse", ".3f")}
         for title, suffix in (("coverage", ""), ("non-zero", "_nonzero")):

@@ -48,14 +48,29 @@ def run(
 ) -> int:  # fmt: skip
     """Calibrate: one row a bias, and where the truth is known the position error before and after."""
     drawn = ["probcal.report.page", "probcal.report.chart"] if outputs is not None and can_plot() else []
-    _load_ahead(["scipy.stats", *drawn] if options["assessed"] else [])
+
+    # import modules that are needed later while kernels compile; what fails to load fails where
+    # it is needed
+    def load() -> None:
+        for name in ["scipy.stats", *drawn] if options["assessed"] else []:
+            with suppress(ImportError):
+                importlib.import_module(name)
+
+    threading.Thread(target=load, daemon=True).start()
     began = time.perf_counter()
     with shown() as progress:
         monitor = Monitor(progress, limit, signals=ENDING)
         tree, network = calibrated(
             model, data, outputs=outputs, resume=resume, overwrite=overwrite, monitor=monitor, **options
         )  # fmt: skip
-    print(table_text(tree))
+    # the table of biases as printed: label, unit, scale, mean, sd, interval, gamma, status, verdict
+    frame = summary(tree)
+    whole = len(frame)
+    frame = printed_rows(frame, -(frame["mean"] / frame["sd"]).abs()).sort_index()
+    columns = [name for name in ("bias", "unit", *FORMS, "status", "verdict") if name in frame]
+    listed = formatted(frame[columns], FORMS).to_string(index=False, justify="right")
+    left_out = f"\n{len(frame)} of {whole} biases, those that are surest not to be zero"
+    print(listed + left_out * (len(frame) < whole))
     _print_verdict(tree, time.perf_counter() - began)
     if outputs is not None:
         say_written(written(tree, network, outputs))
@@ -64,17 +79,6 @@ def run(
     if monitor.signal:
         return 128 + monitor.signal
     return 0 if Status(tree.attrs["status"]).settled else 1
-
-
-def _load_ahead(names: Sequence[str]) -> None:
-    """Import modules that are needed later while kernels compile; what fails to load fails where it is needed."""
-
-    def load() -> None:
-        for name in names:
-            with suppress(ImportError):
-                importlib.import_module(name)
-
-    threading.Thread(target=load, daemon=True).start()
 
 
 def calibrated(
@@ -159,17 +163,6 @@ def _safe(tree: xr.DataTree, outputs: Outputs | None, long: bool) -> Iterator[No
     except BaseException:
         write()
         raise
-
-
-def table_text(tree: xr.DataTree) -> str:
-    """The table of biases as printed: label, unit, scale, mean, sd, interval, gamma, status, verdict."""
-    frame = summary(tree)
-    whole = len(frame)
-    frame = printed_rows(frame, -(frame["mean"] / frame["sd"]).abs()).sort_index()
-    columns = [name for name in ("bias", "unit", *FORMS, "status", "verdict") if name in frame]
-    listed = formatted(frame[columns], FORMS).to_string(index=False, justify="right")
-    left_out = f"\n{len(frame)} of {whole} biases, those that are surest not to be zero"
-    return listed + left_out * (len(frame) < whole)
 
 
 def _print_verdict(tree: xr.DataTree, seconds: float) -> None:

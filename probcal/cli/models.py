@@ -1,6 +1,5 @@
 """Model files: imported, their functions called, whatever they raise in one sentence."""
 
-import hashlib
 import importlib.util
 import inspect
 import sys
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from probcal.cli.options import check_files
 from probcal.errors import FitError, InputError, nearest
+from probcal.files import digest_of_file
 from probcal.lazy import xr
 
 if TYPE_CHECKING:
@@ -111,14 +111,6 @@ def check_here(path: Path, digest: str) -> None:
             f"{path} is not there on {gethostname()}, or another file than here; put it where all workers read"
             " it by the same path"
         )
-
-
-def digest_of_file(path: Path) -> str:
-    """Digest of a file, empty where it cannot be read."""
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError:
-        return ""
 
 
 def load_problem(

@@ -9,7 +9,7 @@ import typer
 
 from probcal.cli.names import METHODS, PRIORS, SAVE
 from probcal.cli.outputs import RECORDINGS
-from probcal.errors import InputError, nearest
+from probcal.errors import InputError, check_known
 from probcal.labels import check_name
 
 MOST_VALUES = 10_000  # of a setting of a study
@@ -101,8 +101,7 @@ def check_priors(method: str, priors: Sequence[str]) -> None:
     """Raise `InputError` for priors, `NAME` or `PATTERN=NAME`, that are not known or that a method does not take."""
     known, split = METHODS[method], [text.rpartition("=") for text in priors]
     for pattern, _, name in split:
-        if name not in PRIORS:
-            raise InputError(f'--prior "{name}" is not known{nearest(name, PRIORS)}')
+        check_known(name, PRIORS, f'--prior "{name}" is not known')
         if name not in known.priors and not (pattern and name == "gaussian"):
             raise InputError(
                 f"{known.title} does not take the prior {PRIORS[name]}; it takes: {', '.join(known.priors)}"

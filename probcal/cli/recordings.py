@@ -14,11 +14,11 @@ import pandas as pd
 
 from probcal.cli import fit
 from probcal.cli.files import say_written, write_csv
-from probcal.cli.models import ModelFile, check_here, digest_of_file
+from probcal.cli.models import ModelFile, check_here
 from probcal.cli.outputs import FIT, results_of_a_run
 from probcal.cli.progress import shown
 from probcal.errors import FitError, InputError
-from probcal.files import Outputs, write_whole
+from probcal.files import Outputs, digest_of_file, write_whole
 from probcal.inference.manifest import check_same, stored_run
 from probcal.inference.progress import Monitor
 from probcal.inference.spread import check_scheduler, spread

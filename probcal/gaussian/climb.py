@@ -16,9 +16,8 @@ import numpy as np
 
 from probcal.gaussian.dense import DenseEngine
 from probcal.gaussian.engine import Expansion, Factors
-from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
 from probcal.gaussian.marginal import volume_slope
-from probcal.gaussian.mode import SETTLED, TRACK_STEPS, Eliminated, Mode, Point, cost, find_tracks, follow
+from probcal.gaussian.mode import SETTLED, TRACK_STEPS, Eliminated, Mode, Point, cost, eliminate, find_tracks, follow
 from probcal.gaussian.search import Search, climb_on_host, climb_traced
 from probcal.gaussian.solves import Dense
 from probcal.linalg import library
@@ -64,7 +63,7 @@ class _Traced(NamedTuple):
 
     def expand(self, point: Point) -> _Eliminated:
         point = find_tracks(self.model, point, TRACK_STEPS, SETTLED)
-        return _Eliminated(point, compress_and_eliminate(self.model, point, linearise_rows(self.model, point))[1])
+        return _Eliminated(point, eliminate(self.model, point, expected=True))
 
     def moved(self, at: _Eliminated, dz: jax.Array) -> Point:
         return follow(self.model, at.point, at.solved.parts, dz)

@@ -14,7 +14,6 @@ from probcal.gaussian.draws import draw_trajectories
 from probcal.gaussian.engine import Engine, Estimate, Factors, Sampled, Spread, density_of
 from probcal.gaussian.linearised import (
     Trajectory,
-    compress_and_eliminate,
     leverages,
     linearise_rows,
     marginal_variances,
@@ -22,11 +21,12 @@ from probcal.gaussian.linearised import (
     trajectories_of,
 )
 from probcal.gaussian.marginal import volume_slope
-from probcal.gaussian.mode import Compressed, Eliminated, Point, follow
+from probcal.gaussian.mode import Eliminated, Point, eliminate_rows, follow
 from probcal.gaussian.solves import Dense
 from probcal.linalg import without_negative
 from probcal.model.model import Data, Model
-from probcal.model.rows import Linearised
+from probcal.model.rows import LinearRows
+from probcal.model.trajectories import States
 from probcal.simulate import derived_keys
 
 
@@ -34,13 +34,13 @@ from probcal.simulate import derived_keys
 class DenseEngine(Engine):
     """Matrices of all biases: the fastest where they fit."""
 
-    cheap: ClassVar[bool] = True
+    cheap = True
     exact: ClassVar[bool] = True
 
-    def at(self, model: Model, point: Point, rows: tuple[Linearised, ...] | None = None) -> DenseExpansion:
+    def at(self, model: Model, point: Point, rows: LinearRows | None = None) -> DenseExpansion:
         """The posterior at a consistent point; rows as the caller linearised them."""
         rows = linearise_rows(model, point) if rows is None else tuple(rows)
-        return DenseExpansion(model, point, rows, *compress_and_eliminate(model, point, rows))
+        return DenseExpansion(model, point, rows, eliminate_rows(model, point, rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +49,7 @@ class DenseExpansion:
 
     model: Model
     point: Point
-    rows: tuple[Linearised, ...]
-    system: Compressed
+    rows: LinearRows
     eliminated: Eliminated
     _kept: list[Any] = field(default_factory=list)  # the factors asked for last, precision and covariance
 
@@ -64,7 +63,7 @@ class DenseExpansion:
         return self.trajectories
 
     @property
-    def held_states(self) -> tuple[jax.Array, ...]:
+    def held_states(self) -> States:
         """Covariance (E, n, n) of every state of each recursion, the biases known."""
         return tuple(own.covariance for own in self.trajectories)
 
@@ -145,11 +144,11 @@ class DenseExpansion:
         states = tuple(np.asarray(v) for v in self.variances(covariance))
         return Spread(own, np.zeros_like(own), states)
 
-    def states(self, factors: Factors) -> tuple[jax.Array, ...]:
+    def states(self, factors: Factors) -> States:
         """Covariance (E, n, n) of every state of each recursion."""
         return _state_covariances(self.trajectories, self.covariance(factors))
 
-    def noises(self, factors: Factors) -> tuple[jax.Array, ...]:
+    def noises(self, factors: Factors) -> States:
         """Variance (E, n) of every whitened noise of each recursion."""
         return marginal_variances(self.model, self.rows, self.trajectories, self.covariance(factors))[1]
 
@@ -177,7 +176,7 @@ class DenseExpansion:
         pairs = zip(self.held_states, moved, strict=True)
         return [np.diagonal(np.asarray(held), axis1=1, axis2=2) + own for held, own in pairs]
 
-    def variances(self, covariance: jax.Array) -> tuple[jax.Array, ...]:
+    def variances(self, covariance: jax.Array) -> States:
         """Variance (E, n) of every state of each recursion, for a covariance (M, M) of the biases."""
         return state_variances(self.trajectories, covariance)
 
@@ -186,7 +185,7 @@ _solved = jax.jit(Dense.of)
 
 
 @jax.jit
-def _state_covariances(trajectories: tuple[Trajectory, ...], covariance: jax.Array) -> tuple[jax.Array, ...]:
+def _state_covariances(trajectories: tuple[Trajectory, ...], covariance: jax.Array) -> States:
     return tuple(
         own.covariance + jnp.einsum("eni,ij,emj->enm", own.response, covariance, own.response) for own in trajectories
     )

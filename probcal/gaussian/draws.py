@@ -14,6 +14,7 @@ from probcal.gaussian.engine import Expansion
 from probcal.gaussian.mode import Eliminated, Point
 from probcal.model.model import At, Data, Model
 from probcal.model.rows import Linearised
+from probcal.model.trajectories import States
 from probcal.simulate import derived_keys, standard_normals
 
 PASS = 200  # draws that are made at once
@@ -26,7 +27,7 @@ LARGE = 500_000  # data above which only the sum of their log-likelihoods is kep
 class JointDraws(NamedTuple):
     """Draws of trajectories and of what hangs on them; empty where it was not asked for."""
 
-    states: tuple[jax.Array, ...]  # (D, E, n) of each recursion
+    states: States  # (D, E, n) of each recursion
     log_likelihood: Data  # (D, N, C) of each block, (D, 1, 1) in sum where data are many (`many_data`)
     replicas: Data  # (D, N, C) of each block
 
@@ -66,7 +67,7 @@ def draw(
         seeds = derived_keys(key, (2 * k, 2 * k + 1))
         mine = jax.device_put(biases[chosen])
         states = draw_trajectories(at, mine, seeds[0])
-        by_datum: tuple[Data, Data] = ((), ())
+        by_datum = ((), ())
         if {"log_likelihood", "replicas"} & set(keep):
             told, again = predictive(at.model, log_levels[chosen], mine, states, seeds[1], keep)
             by_datum = tuple(part.sum((1, 2), keepdims=True) for part in told) if large else told, again
@@ -75,7 +76,7 @@ def draw(
     return jax.tree.map(lambda *parts: np.concatenate(parts), *passes)
 
 
-def draw_trajectories(at: Expansion, z: jax.Array, key: jax.Array) -> tuple[jax.Array, ...]:
+def draw_trajectories(at: Expansion, z: jax.Array, key: jax.Array) -> States:
     """Trajectories (D, E, n) of each recursion given biases z (D, M).
 
     Draws from the motion, less their smoothed selves, all as columns of one pass (Durbin and Koopman 2002).
@@ -113,7 +114,7 @@ def _simulated(
 
 
 @jax.jit
-def _pulled(model: Model, point: Point, rows: Sequence[Linearised], z: jax.Array) -> tuple[jax.Array, ...]:
+def _pulled(model: Model, point: Point, rows: Sequence[Linearised], z: jax.Array) -> States:
     """The pull on the states (E, n, D) of biases z (D, M) in the place of a point's."""
     along = model.by_bias(rows, (z - point.z[None, :]).T)
     weighted = tuple(lin.weight[:, :, None] * own for *_, lin, own in model.each_block(rows, along))
@@ -122,7 +123,7 @@ def _pulled(model: Model, point: Point, rows: Sequence[Linearised], z: jax.Array
 
 @partial(jax.jit, static_argnames="keep")
 def predictive(
-    model: Model, levels: jax.Array, z: jax.Array, states: tuple[jax.Array, ...], key: jax.Array, keep: tuple[str, ...]
+    model: Model, levels: jax.Array, z: jax.Array, states: States, key: jax.Array, keep: tuple[str, ...]
 ) -> tuple[Data, Data]:
     """Log-likelihood and replicas (D, N, C) of every datum at draws, one draw after the other; empty if not kept."""
 

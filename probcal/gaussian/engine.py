@@ -27,7 +27,8 @@ from probcal.gaussian.mode import (
     mixing_gain,
 )
 from probcal.model.model import Data, Model
-from probcal.model.rows import Linearised
+from probcal.model.rows import LinearRows
+from probcal.model.trajectories import States
 from probcal.priors import Precision
 
 
@@ -140,7 +141,7 @@ class Expansion(Protocol):
         """The point of the expansion."""
 
     @property
-    def rows(self) -> tuple[Linearised, ...]:
+    def rows(self) -> LinearRows:
         """The linearised rows of each block."""
 
     @property
@@ -218,7 +219,7 @@ class Engine(Protocol):
         `predicted` and `leverages` raise `InputError`.
         """
 
-    def at(self, model: Model, point: Point, rows: tuple[Linearised, ...] | None = None) -> Expansion:
+    def at(self, model: Model, point: Point, rows: LinearRows | None = None) -> Expansion:
         """The posterior at a consistent point; rows as the caller linearised them, by default with
         the expected information."""
 
@@ -248,19 +249,22 @@ def evidence(at: Expansion, prior: Precision, factors: Factors | None = None) ->
     return Estimate(at.density() + own - 0.5 * volume.value, 0.5 * volume.error)
 
 
-def noise_score(at: Expansion, factors: Factors) -> tuple[Data, tuple[jax.Array, ...]]:
+def noise_score(at: Expansion, factors: Factors) -> tuple[Data, States]:
     """Terms of the slope of the log evidence by log noise levels, biases and trajectories
     integrated.
 
     Of every datum (N, C) of each block, and of every whitened noise (E, n) of each recursion.
     """
-    return _noise_terms(at.model, at.point, tuple(at.predicted(factors)), tuple(at.noises(factors)))
+    return _noise_score(at.model, at.point, tuple(at.predicted(factors)), tuple(at.noises(factors)))
 
 
-def noise_information(at: Expansion, factors: Factors) -> tuple[Data, tuple[jax.Array, ...]]:
-    """The same of the information about log noise levels, less what noises that hang together add:
-    a lower bound."""
-    return _noise_information(at.model, at.point, tuple(at.predicted(factors)), tuple(at.noises(factors)))
+def noise_terms(at: Expansion, factors: Factors) -> list[tuple[Data, States]]:
+    """`noise_score`, and the same of the information about log noise levels.
+
+    That is a lower bound: it lacks what noises that hang together add.
+    """
+    given = at.model, at.point, tuple(at.predicted(factors)), tuple(at.noises(factors))
+    return [_noise_score(*given), _noise_information(*given)]
 
 
 def density_of(model: Model, point: Point, volume: jax.Array) -> float:
@@ -271,18 +275,14 @@ def density_of(model: Model, point: Point, volume: jax.Array) -> float:
 
 
 @jax.jit
-def _noise_terms(
-    model: Model, point: Point, spread: Data, driven: tuple[jax.Array, ...]
-) -> tuple[Data, tuple[jax.Array, ...]]:
+def _noise_score(model: Model, point: Point, spread: Data, driven: States) -> tuple[Data, States]:
     parts = (model.level_score(point), model.information(point), spread, model.measured)
     rows = jax.tree.map(lambda score, weight, own, there: score + weight * own - there, *parts)
     return rows, jax.tree.map(lambda u, variance: u**2 + variance - 1.0, tuple(point.noises), driven)
 
 
 @jax.jit
-def _noise_information(
-    model: Model, point: Point, spread: Data, driven: tuple[jax.Array, ...]
-) -> tuple[Data, tuple[jax.Array, ...]]:
+def _noise_information(model: Model, point: Point, spread: Data, driven: States) -> tuple[Data, States]:
     parts = (model.information(point), spread, model.measured)
     rows = jax.tree.map(lambda weight, own, there: 2.0 * there * (1.0 - weight * own) ** 2, *parts)
     return rows, jax.tree.map(lambda own: 2.0 * (1.0 - own) ** 2, driven)

@@ -33,6 +33,7 @@ from probcal.gaussian.mode import (
 from probcal.linalg import inverse_cholesky, multiply
 from probcal.model.model import Model, Recursion, scaled
 from probcal.model.rows import Linearised
+from probcal.model.trajectories import States
 
 STEP = 0.05  # of a log level, for differences
 
@@ -76,7 +77,7 @@ class Frame(NamedTuple):
         """Linear term of the marginal log-likelihood about zero, (Q,)."""
         return self.information @ self.theta + self.score
 
-    def normals(self, keys: Any) -> tuple[jax.Array, ...]:
+    def normals(self, keys: Any) -> States:
         """Unit normals eps (E, n) of each state layout, each drawn from its own key."""
         return tuple(map(jax.random.normal, keys, [x.shape for x in self.point.states]))
 
@@ -112,17 +113,17 @@ def closed_loop(part: Recursion, L: jax.Array, J: jax.Array, score: jax.Array, u
     return Closed(feedback, factor / size[:, None, :], jnp.log(size), shift)
 
 
-def averaged(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> list[Linearised]:
+def averaged(model: Model, frame: Frame, theta: jax.Array, eps: States) -> list[Linearised]:
     """Every block linearised at the frame's point, with score and curvature averaged over draws.
 
     These are the moments of the best Gaussian approximation of the joint posterior (Opper, Archambeau 2009). Draws
     theta (D, Q), eps (D, E, n) are taken with their mirror images, so that what is linear stays exact.
     """
 
-    def at(theta: jax.Array, eps: tuple[jax.Array, ...]) -> tuple[tuple[jax.Array, jax.Array], ...]:
+    def at(theta: jax.Array, eps: States) -> tuple[tuple[jax.Array, jax.Array], ...]:
         return model.slopes(place(model, frame, theta, eps))
 
-    def pair(draw: tuple[jax.Array, tuple[jax.Array, ...]]) -> list[tuple[jax.Array, jax.Array]]:
+    def pair(draw: tuple[jax.Array, States]) -> list[tuple[jax.Array, jax.Array]]:
         theta, eps = draw
         mirrored = at(2 * frame.theta - theta, tuple(-e for e in eps))
         return jax.tree.map(lambda a, b: 0.5 * (a + b), at(theta, eps), mirrored)
@@ -155,7 +156,7 @@ def frame_at(model: Model, point: Point) -> Frame:
 
 
 @jax.jit
-def refined(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> Frame:
+def refined(model: Model, frame: Frame, theta: jax.Array, eps: States) -> Frame:
     """The frame with trajectories and curvature fitted to draws theta (D, Q), eps (D, E, n) of it (see `averaged`)."""
     lins = averaged(model, frame, theta, eps)
     compressed = compress(model, lins)
@@ -173,7 +174,9 @@ def _frame(model: Model, point: Point, lins: Sequence[Linearised]) -> Frame:
     if H:
         values, slopes = _at(model, point, point.levels[None] + _moves(H))
         information, score = _with_levels(information, score, values, slopes, H)
-    by_level = [_share(model, point, lins, h) for h in range(H if model.driven else 0)]
+    by_level = [
+        model.of_states(scaled(lins, [data.level == h for data in model.rows])) for h in range(H if model.driven else 0)
+    ]
     loops = []
     for r, (part, kept) in enumerate(model.each_layout(solved.parts)):
         L, J, pull = factors(part, point.levels), kept.J, kept.pull
@@ -181,18 +184,11 @@ def _frame(model: Model, point: Point, lins: Sequence[Linearised]) -> Frame:
         closed = closed_loop(part, L, J, pull, point.noises[r])
         closed = closed._replace(shift=jnp.zeros_like(pull))  # the point is the mean, by definition
         own = [share[r] for share in by_level]
-        shares = (
-            jnp.stack([J_h for J_h, _ in own]) if own else jnp.zeros((0, *J.shape)),
-            jnp.stack([pull_h for _, pull_h in own]) if own else jnp.zeros((0, *pull.shape)),
-        )
+        none = jnp.zeros((0, *J.shape)), jnp.zeros((0, *pull.shape))
+        shares = jax.tree.map(lambda *each: jnp.stack(each), *own) if own else none
         loops.append(Loop(-smooth.states, -smooth.noises, closed, (J, pull), shares))
     height = log_density(model, point) - 0.5 * solved.logdet
     return Frame(point, information, score, height, tuple(loops))
-
-
-def _share(model: Model, point: Point, lins: Sequence[Linearised], h: int) -> list[tuple[jax.Array, jax.Array]]:
-    """Information and score of the states of each recursion by the data whose noise has unknown level h."""
-    return model.of_states(scaled(lins, [data.level == h for data in model.rows]))
 
 
 def _moves(H: int) -> np.ndarray:
@@ -245,12 +241,12 @@ def _closed(model: Model, frame: Frame, theta: jax.Array) -> list[Closed]:
     return list(model.each(closed, frame.loops, frame.point.noises))
 
 
-def place(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> Point:
+def place(model: Model, frame: Frame, theta: jax.Array, eps: States) -> Point:
     """The point of theta (Q,) and unit normals eps (E, n) of each recursion."""
     return _placed(model, frame, theta, eps, _closed(model, frame, theta))
 
 
-def _placed(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...], loops: list[Closed]) -> Point:
+def _placed(model: Model, frame: Frame, theta: jax.Array, eps: States, loops: list[Closed]) -> Point:
     M = frame.point.z.shape[0]
     step = theta[:M] - frame.point.z
 
@@ -276,7 +272,7 @@ def _placed(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, 
     return at_levels(model, point, theta[M:]) if theta.shape[0] > M else point
 
 
-def unit_normals(model: Model, frame: Frame, point: Point) -> tuple[jax.Array, ...]:
+def unit_normals(model: Model, frame: Frame, point: Point) -> States:
     """The unit normals eps (E, n) of each recursion that `place` makes a consistent point of."""
     step = point.z - frame.point.z
     away = jax.tree.map(
@@ -285,8 +281,8 @@ def unit_normals(model: Model, frame: Frame, point: Point) -> tuple[jax.Array, .
 
     def normals(_: Recursion, loop: Loop, at: Closed, dx: jax.Array, du: jax.Array) -> jax.Array:
         deviations = dx - loop.states @ step
-        before = jnp.concatenate([jnp.zeros_like(dx[:1]), deviations[:-1]])
-        own = du - loop.noises @ step - at.shift + jnp.einsum("eij,ej->ei", at.feedback, before)
+        fed = jnp.einsum("eij,ej->ei", at.feedback, linalg.preceding(deviations))
+        own = du - loop.noises @ step - at.shift + fed
         solved = linalg.solve_batched(at.factor @ at.factor.mT, own)
         return jnp.exp(-at.size) * jnp.einsum("eji,ej->ei", at.factor, solved)
 
@@ -303,7 +299,7 @@ def _volume(model: Model, frame: Frame, theta: jax.Array, loops: list[Closed]) -
     return sum((jnp.sum(at.size) for at in loops), change)
 
 
-def log_joint(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> jax.Array:
+def log_joint(model: Model, frame: Frame, theta: jax.Array, eps: States) -> jax.Array:
     """Log density of data and eps given theta, less that of independent unit normals' constant; -inf if not finite."""
     loops = _closed(model, frame, theta)
     point = _placed(model, frame, theta, eps, loops)
@@ -311,7 +307,7 @@ def log_joint(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array
     return jnp.where(jnp.isfinite(value), value, -jnp.inf)
 
 
-def log_weight(model: Model, frame: Frame, theta: jax.Array, eps: tuple[jax.Array, ...]) -> jax.Array:
+def log_weight(model: Model, frame: Frame, theta: jax.Array, eps: States) -> jax.Array:
     """Log of the joint density of data and trajectories over the frame's: zero where the frame is exact."""
     squares = sum(jnp.sum(e**2) for e in eps)
     return log_joint(model, frame, theta, eps) + 0.5 * squares - frame.log_likelihood(theta)

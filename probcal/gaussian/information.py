@@ -10,6 +10,8 @@ from probcal.gaussian.draws import residuals
 from probcal.gaussian.mode import Point, factors
 from probcal.misfit import Rejected
 from probcal.model.model import Data, Model, Recursion
+from probcal.model.rows import families_at
+from probcal.model.trajectories import States
 from probcal.noise import HALF
 from probcal.problem import Problem
 
@@ -36,10 +38,11 @@ def rejected(problem: Problem, point: Point) -> list[Rejected]:
     owners = [problem.measurements.sensor[index] for index in problem.row_index]
     left, found = residuals(model, point), list[Rejected]()
     counts: dict[tuple[str, float], np.ndarray] = {}  # below half weight, of these not gross, all
-    for b, noises in enumerate(model.noises_at(point.levels)):
+    for b, block in enumerate(model.blocks):
         mask = np.asarray(model.measured[b])
         low = np.asarray(left.reliance[b]) < HALF * mask
         near = np.abs(left.innovation[b]) < GROSS * np.asarray(left.std[b])
+        noises = families_at(block, np.asarray(point.levels))
         for c, (channel, noise) in enumerate(zip(problem.columns[b], noises, strict=True)):
             kinds = (low[:, c], low[:, c] & near[:, c], mask[:, c] > 0)
             each = np.stack([np.bincount(owners[b], kind, len(sensors)) for kind in kinds])
@@ -78,7 +81,7 @@ def growing_square(model: Model, point: Point) -> float:
     return square / max(count, 1.0)
 
 
-def state_covariances(model: Model, point: Point) -> tuple[jax.Array, ...]:
+def state_covariances(model: Model, point: Point) -> States:
     """Covariances (E, n, n) of every smoothed state at held biases, linearised at a point."""
     compressed = model.of_states(model.linearise(point, expected=True))
 
@@ -89,7 +92,7 @@ def state_covariances(model: Model, point: Point) -> tuple[jax.Array, ...]:
     return model.each(of, compressed, map(model.entries, range(len(compressed))))
 
 
-def update_levels(model: Model, point: Point, spread: Data, driven: tuple[jax.Array, ...]) -> Point:
+def update_levels(model: Model, point: Point, spread: Data, driven: States) -> Point:
     """One MacKay step of every unknown noise level, kept within its declared factor by its log-normal prior.
 
     A level sigma of N whitened residuals v solves N - sum Var v = sum v^2 (Paper B 25, for noise);

@@ -58,17 +58,14 @@ class Products(Factor):
         self._across, self._within = self._whole[:states, states:].tocsr(), self._whole[states:, states:].tocsr()
         self._back, self._members, self._size = self._across.T.tocsr(), places.blocks - states, places.size - states
         self._probes = BLOCK * (int(np.clip(PROBED // self._size, FEW, MANY)) // BLOCK)
-        self._lower = np.linalg.cholesky(self._blocks())
-        self._inverse = np.linalg.inv(self._lower)
-
-    def _blocks(self) -> np.ndarray:
-        """What the matrix has between the biases of each sensor (B, p, p), the tracks known."""
+        # what the matrix has between the biases of each sensor (B, p, p), the tracks known
         M, members = self._size, self._members
         low, high = np.broadcast_arrays(members[:, :, None], members[:, None, :])
         there = (low < M) & (high < M)
         found = np.where(there, 0.0, np.eye(members.shape[1])[None])
         found[there] = np.asarray(self._within[low[there], high[there]]).ravel()
-        return found
+        self._lower = np.linalg.cholesky(found)
+        self._inverse = np.linalg.inv(self._lower)
 
     def _left(self, z: np.ndarray) -> np.ndarray:
         """S times columns z (M, K)."""

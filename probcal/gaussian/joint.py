@@ -20,8 +20,9 @@ import numpy as np
 from probcal.gaussian.engine import Factors
 from probcal.gaussian.factor import Entries, leading, mirrored
 from probcal.gaussian.mode import factors, inverse_factors
+from probcal.linalg import outer
 from probcal.model.model import Model
-from probcal.model.rows import Linearised
+from probcal.model.rows import LinearRows
 
 
 def missing(model: Model) -> str:
@@ -105,7 +106,7 @@ class JointPrecision:
         places = Entries(low.astype(np.int32), high.astype(np.int32), size, diagonal, blocks)
         return cls(places, kept, times[kept], tuple(slots), tuple(driven), start, len(rows), extra)
 
-    def values(self, model: Model, lins: tuple[Linearised, ...], levels: jax.Array) -> np.ndarray:
+    def values(self, model: Model, lins: LinearRows, levels: jax.Array) -> np.ndarray:
         """Entries (entries,) of the precision of data and motion, the biases without prior."""
         found = np.asarray(_values(model, lins, levels))
         more = np.zeros(len(self.extra))
@@ -134,7 +135,7 @@ class JointPrecision:
     def holds(self, members: np.ndarray) -> bool:
         """Whether all pairs of biases (B, p) of a row have a place."""
         there = members < self.places.size - self.states
-        return bool((self.pairs(members) >= 0)[there[:, :, None] & there[:, None, :]].all())
+        return bool((self.pairs(members) >= 0)[outer(there)].all())
 
     def block_values(self, members: np.ndarray, pairs: np.ndarray, inverse: np.ndarray) -> np.ndarray:
         """Covariances (B, p, p) of biases (B, p), of their `pairs` in the inverse at the places of
@@ -178,7 +179,7 @@ class JointPrecision:
             at += E * (2 * half + n * n)
         return found
 
-    def predicted_variances(self, model: Model, lins: tuple[Linearised, ...], inverse: np.ndarray) -> list[np.ndarray]:
+    def predicted_variances(self, model: Model, lins: LinearRows, inverse: np.ndarray) -> list[np.ndarray]:
         """Variance (N, C) of each predicted value of each block, from the inverse at the places of
         the entries."""
         whole, states = np.zeros(self.count), [own for own, _, _ in self.steps(model, inverse)]
@@ -256,10 +257,10 @@ def blocks_of(model: Model) -> np.ndarray:
     taken[M] = True
     wide = max((data.bias.shape[1] for data in model.rows), default=1)
     for data in model.rows:
-        own: np.ndarray = np.sort(np.asarray(data.bias), 1)
+        own = np.sort(np.asarray(data.bias), 1)
         own = np.where(np.concatenate([np.zeros((len(own), 1), bool), own[:, 1:] == own[:, :-1]], 1), M, own)
         values, first = np.unique(own, return_index=True)
-        mine: np.ndarray = np.full(own.size, M)
+        mine = np.full(own.size, M)
         mine[first] = np.where(taken[values], M, values)
         taken[values] = True
         room = wide - own.shape[1]
@@ -301,7 +302,7 @@ def _entries(
 
 
 @jax.jit
-def _values(model: Model, lins: tuple[Linearised, ...], levels: jax.Array) -> jax.Array:
+def _values(model: Model, lins: LinearRows, levels: jax.Array) -> jax.Array:
     """Values of the blocks of the joint precision in the order of `_entries`, the diagonal of the
     biases zero."""
     found = []

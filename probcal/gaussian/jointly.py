@@ -15,10 +15,10 @@ import jax.numpy as jnp
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.engine import Expansion, Factors
 from probcal.model.model import Data, Model
-from probcal.model.rows import Linearised
+from probcal.model.rows import LinearRows
+from probcal.model.trajectories import States
 
 Gains = tuple[rec.Gains, ...]  # of each recursion
-Rows = tuple[Linearised, ...]  # of each block
 
 
 class Variables(NamedTuple):
@@ -36,12 +36,12 @@ def covariance_times(at: Expansion, factors: Factors, slopes: Variables) -> Vari
     return Variables(_followed(at.model, at.rows, gains, held, dz), dz)
 
 
-def times_weights(model: Model, rows: Rows, columns: Data) -> Data:
+def times_weights(model: Model, rows: LinearRows, columns: Data) -> Data:
     """Columns (N, C, K) of the data times their weights."""
     return tuple(lin.weight[:, :, None] * own for *_, lin, own in model.each_block(rows, columns))
 
 
-def follow_biases(model: Model, rows: Rows, gains: Gains, dz: jax.Array) -> tuple[rec.Smoothed, ...]:
+def follow_biases(model: Model, rows: LinearRows, gains: Gains, dz: jax.Array) -> tuple[rec.Smoothed, ...]:
     """Changes (E, n, K) of states and noises that follow the biases by dz (M, K), by columns of the
     rows: no (E, n, M) is made."""
     pulls = model.onto_states(rows, times_weights(model, rows, model.by_bias(rows, -dz)))
@@ -49,16 +49,12 @@ def follow_biases(model: Model, rows: Rows, gains: Gains, dz: jax.Array) -> tupl
 
 
 @jax.jit
-def _held(
-    model: Model, rows: Rows, gains: Gains, spread: tuple[jax.Array, ...], slopes: Variables
-) -> tuple[tuple[jax.Array, ...], jax.Array]:
+def _held(model: Model, rows: LinearRows, gains: Gains, spread: States, slopes: Variables) -> tuple[States, jax.Array]:
     """Changes (E, n, K) of the states at held biases, and the slope (M, K) that these leave to the biases."""
     held = model.each(lambda _, gain, own, b: rec.respond(gain, own, b), gains, spread, slopes.states)
     return held, slopes.z - model.onto_biases(rows, times_weights(model, rows, model.by_state(rows, held)))
 
 
 @jax.jit
-def _followed(
-    model: Model, rows: Rows, gains: Gains, held: tuple[jax.Array, ...], dz: jax.Array
-) -> tuple[jax.Array, ...]:
+def _followed(model: Model, rows: LinearRows, gains: Gains, held: States, dz: jax.Array) -> States:
     return jax.tree.map(lambda own, by: own + by.states, held, follow_biases(model, rows, gains, dz))

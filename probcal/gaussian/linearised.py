@@ -13,11 +13,9 @@ import jax.numpy as jnp
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.mode import (
-    Compressed,
     Eliminated,
     Point,
-    compress_rows,
-    eliminate_compressed,
+    eliminate,
     factors,
     log_density,
     mixing_gain,
@@ -25,7 +23,8 @@ from probcal.gaussian.mode import (
 )
 from probcal.gaussian.solves import Dense
 from probcal.model.model import Data, Model, Where
-from probcal.model.rows import Linearised
+from probcal.model.rows import Linearised, LinearRows
+from probcal.model.trajectories import States
 from probcal.priors import Precision
 
 
@@ -58,7 +57,7 @@ class Trajectory(NamedTuple):
 
 
 @jax.jit
-def state_variances(trajectories: Sequence[Trajectory], covariance: jax.Array) -> tuple[jax.Array, ...]:
+def state_variances(trajectories: Sequence[Trajectory], covariance: jax.Array) -> States:
     """Variance (E, n) of every state of each recursion, for a covariance (M, M) of z."""
     return tuple(
         jnp.diagonal(own.covariance, axis1=1, axis2=2)
@@ -70,7 +69,7 @@ def state_variances(trajectories: Sequence[Trajectory], covariance: jax.Array) -
 @jax.jit
 def marginal_variances(
     model: Model, rows: Sequence[Linearised], trajectories: Sequence[Trajectory], covariance: jax.Array
-) -> tuple[Data, tuple[jax.Array, ...]]:
+) -> tuple[Data, States]:
     """Variance (N, C) of each predicted value and (E, n) of every whitened noise, for a covariance (M, M) of z."""
     alone = model.state_variance(rows, [own.covariance for own in trajectories])
     predicted = jax.tree.map(jnp.add, alone, _by_bias(model, rows, trajectories, covariance))
@@ -109,16 +108,9 @@ def given_biases(model: Model, levels: jax.Array, solved: Eliminated) -> tuple[G
     return tuple(found)
 
 
-def linearise_rows(model: Model, point: Where) -> tuple[Linearised, ...]:
+def linearise_rows(model: Model, point: Where) -> LinearRows:
     """All rows linearised at a point with the expected information."""
-    found: tuple[Linearised, ...] = rows_at(model, point, True)
-    return found
-
-
-def compress_and_eliminate(model: Model, point: Point, rows: tuple[Linearised, ...]) -> tuple[Compressed, Eliminated]:
-    """Linearised rows compressed, and the system without its trajectories."""
-    system = compress_rows(model, point.z, rows, True)
-    return system, eliminate_compressed(model, point.noises, point.levels, system)
+    return rows_at(model, point, True)
 
 
 @jax.jit
@@ -141,7 +133,7 @@ def laplace(model: Model, point: Point, prior: Precision) -> LaplaceApproximatio
     A precision of 0 is a flat prior: its density counts as one. The expected information is used throughout. Where
     process noise is not Gaussian it is the variational lower bound of the evidence (see `mixing_gain`).
     """
-    return laplace_of(model, point, compress_and_eliminate(model, point, linearise_rows(model, point))[1], prior)
+    return laplace_of(model, point, eliminate(model, point, expected=True), prior)
 
 
 @jax.jit

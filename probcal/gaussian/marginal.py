@@ -13,15 +13,15 @@ import jax.numpy as jnp
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.mode import Eliminated, Point, factors, log_likelihood
 from probcal.model.model import At, Model
+from probcal.model.trajectories import States
 
-States = tuple[jax.Array, ...]  # (E, n) of each recursion
 ROUNDS, EXACT = 31, 1e-14  # of an adjoint solve at most; share of its first square that ends it
 SMALL = 1e-6  # share of its first square from which on an adjoint solve is good enough
 
 
 @jax.jit
 def volume_slope(
-    model: Model, point: Point, solved: Eliminated, only: tuple[jax.Array, ...] | None = None
+    model: Model, point: Point, solved: Eliminated, only: States | None = None
 ) -> tuple[jax.Array, jax.Array]:
     """Derivative (M,) of log det W by z at a point whose trajectories are at their mode, these following.
 

@@ -19,8 +19,8 @@ from probcal.gaussian.search import DAMPING, ROUNDING, between, branch, damped_o
 from probcal.gaussian.solves import Dense
 from probcal.linalg import library
 from probcal.model.model import At, Model, Recursion, Tail, Where
-from probcal.model.rows import Linearised
-from probcal.model.trajectories import Trajectories
+from probcal.model.rows import Linearised, LinearRows, level_factors
+from probcal.model.trajectories import States, Trajectories
 from probcal.priors import Precision
 
 CHORD = 0.1  # share of the last gain up to which what was eliminated serves on
@@ -68,7 +68,7 @@ class Compressed(NamedTuple):
     information: jax.Array  # (M, M) of the biases at fixed trajectories
     score: jax.Array  # (M,)
     states: tuple[tuple[jax.Array, jax.Array], ...]  # of each recursion: J (E, n, n), score (E, n)
-    crosses: tuple[jax.Array, ...]  # (E, n, M) cross information with the biases
+    crosses: States  # (E, n, M) cross information with the biases
 
 
 class Eliminated(NamedTuple):
@@ -93,7 +93,7 @@ class Kept(NamedTuple):
 @partial(jax.jit, inline=True)  # one kernel where it stands alone
 def factors(part: Recursion, levels: jax.Array) -> jax.Array:
     """Noise factors with the estimated levels, and the precisions of noise that is not Gaussian, (E, n, n)."""
-    scale = jnp.concatenate([jnp.exp(levels), jnp.ones(1, levels.dtype)])[part.level]
+    scale = level_factors(levels)[part.level]
     scale = scale / jnp.sqrt(part.weight) if part.tails else scale
     return part.L * scale[:, None, :]
 
@@ -108,7 +108,7 @@ def inverse_factors(part: Recursion, levels: jax.Array) -> jax.Array:
 @partial(jax.jit, inline=True)
 def noises_of(part: Recursion, levels: jax.Array, states: jax.Array) -> jax.Array:
     """The shortest whitened noises (E, n) that drive states (E, n) of one recursion without drift."""
-    before = jnp.concatenate([jnp.zeros_like(states[:1]), states[:-1]])
+    before = linalg.preceding(states)
     left = states - jnp.einsum("eij,ej->ei", part.F, before)
     return jnp.einsum("eij,ej->ei", inverse_factors(part, levels), left)
 
@@ -140,13 +140,6 @@ def log_density(model: Model, point: Point) -> jax.Array:
 def _tilt(model: Model, point: Where) -> Any:
     """The log density of integrated places at a point."""
     return np.zeros(()) if model.tilt is None else model.tilt.value(point.z)
-
-
-def track_costs(model: Model, point: Point) -> jax.Array:
-    """Negative log density (T,) of the data and the whitened noises of each target."""
-    sums = model.by_epoch(model.log_likelihood(point))
-    own = model.each(lambda _, own, u: 0.5 * jnp.sum(u**2, 1) - own, sums, point.noises)
-    return jnp.concatenate(model.by_target(own))
 
 
 def mixed_density(model: Model, point: Point) -> jax.Array:
@@ -208,7 +201,7 @@ def eliminate(model: Model, point: Point, *, expected: bool, joint: bool = True)
 
 
 @jax.jit
-def rows_at(model: Model, point: Where, expected: Any) -> tuple[Linearised, ...]:
+def rows_at(model: Model, point: Where, expected: Any) -> LinearRows:
     """All rows linearised at a point, a kernel for step weights and for the expected information."""
     return model.linearise(point, expected=expected)
 
@@ -220,7 +213,7 @@ def eliminate_rows(model: Model, point: Point, lins: Sequence[Linearised], *, jo
 
 
 @partial(jax.jit, static_argnames="joint")
-def compress_rows(model: Model, z: jax.Array, lins: tuple[Linearised, ...], joint: bool) -> Compressed:
+def compress_rows(model: Model, z: jax.Array, lins: LinearRows, joint: bool) -> Compressed:
     """Rows compressed onto states and biases, with the tilt of the model at z."""
     compressed = compress(model, lins, joint=joint)
     return tilted(model, z, compressed) if joint else compressed
@@ -250,7 +243,7 @@ def tilted(model: Model, z: jax.Array, compressed: Compressed) -> Compressed:
 
 def eliminate_compressed(
     model: Model,
-    noises: tuple[jax.Array, ...],
+    noises: States,
     levels: jax.Array,
     compressed: Compressed,
     *,
@@ -283,7 +276,7 @@ def gains_of(part: Recursion, levels: jax.Array, J: jax.Array, used: tuple[int, 
 @partial(jax.jit, static_argnames="joint")
 def _eliminated(
     model: Model,
-    noises: tuple[jax.Array, ...],
+    noises: States,
     levels: jax.Array,
     told: tuple[jax.Array, jax.Array],
     parts: tuple[Kept, ...],
@@ -357,7 +350,10 @@ def part_way(model: Model, point: Point, full: Point, shares: jax.Array) -> tupl
     by_epoch = model.each(lambda part, share: share[part.target][:, None], own)
     most = jnp.max(shares, initial=0.0)
     found = jax.tree.map(between, point, full, Point(by_epoch, by_epoch, most, most))
-    return track_costs(model, found), found
+    # negative log density (T,) of the data and the whitened noises of each target
+    sums = model.by_epoch(model.log_likelihood(found))
+    costs = model.each(lambda _, own, u: 0.5 * jnp.sum(u**2, 1) - own, sums, found.noises)
+    return jnp.concatenate(model.by_target(costs)), found
 
 
 def shortened(

@@ -15,10 +15,12 @@ import numpy as np
 
 from probcal import linalg
 from probcal.gaussian.held import hold
-from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
+from probcal.gaussian.linearised import linearise_rows
 from probcal.gaussian.marginal import volume_slope
-from probcal.gaussian.mode import Point, factors
+from probcal.gaussian.mode import Point, eliminate_rows, factors
+from probcal.geometry import lattice
 from probcal.model.model import TILTED, At, Model, Recursion, Tilt
+from probcal.model.trajectories import States
 
 MOST = 3  # entries of a state that is integrated
 FEW = 2  # poses above the dimension up to which a place may be a ring or one of two
@@ -60,14 +62,19 @@ def tilt_of(model: Model, point: Point, still: tuple[Still, ...]) -> Tilt | None
         return Tilt.none(M)
     height, slope, information = _gain(model, point, still, *_cells(model, point, still))
     epochs, rows = model.each(lambda part, s: s.on[part.target], still), linearise_rows(model, point)
-    solved = hold(model, point, rows) if information is None else compress_and_eliminate(model, point, rows)[1]
+    solved = hold(model, point, rows) if information is None else eliminate_rows(model, point, rows)
     volume, sound = volume_slope(model, point, solved, epochs)
     slope, curvature = slope + 0.5 * np.asarray(volume), Tilt.none(M).curvature
     if information is not None:
         laplace, exact = np.asarray(solved.information), information + np.asarray(_schur(model, point, still))
         if not (np.isfinite(laplace).all() and np.isfinite(exact).all()):
             return None
-        curvature = _bounded(laplace, exact)
+        # A curvature (M, M) that leaves its share of the information (M, M) of Laplace's formula along every direction
+        root = np.linalg.cholesky(laplace + (1e-9 * np.trace(laplace) + 1e-6) * np.eye(len(laplace)))
+        half = np.linalg.solve(root, np.linalg.solve(root, 0.5 * (exact + exact.T)).T)
+        values, vectors = np.linalg.eigh(0.5 * (half + half.T))
+        back = root @ vectors
+        curvature = (back * np.maximum(values, LEAST - 1.0)) @ back.T
     if not (bool(sound) and np.isfinite(height) and np.isfinite(slope).all() and np.isfinite(curvature).all()):
         return None
     return Tilt(np.asarray(point.z), np.asarray(height), slope, curvature)
@@ -80,15 +87,6 @@ def tilt_at(model: Model, point: Point) -> Tilt:
     places = places_of(plain, point)
     found = None if places is None else tilt_of(plain, point, places)
     return none if found is None else found
-
-
-def _bounded(information: np.ndarray, curvature: np.ndarray) -> np.ndarray:
-    """A curvature (M, M) that leaves its share of the information (M, M) of Laplace's formula along every direction."""
-    root = np.linalg.cholesky(information + (1e-9 * np.trace(information) + 1e-6) * np.eye(len(information)))
-    half = np.linalg.solve(root, np.linalg.solve(root, 0.5 * (curvature + curvature.T)).T)
-    values, vectors = np.linalg.eigh(0.5 * (half + half.T))
-    back = root @ vectors
-    return (back * np.maximum(values, LEAST - 1.0)) @ back.T
 
 
 def _still(model: Model, point: Point) -> tuple[Still, ...] | None:
@@ -107,7 +105,7 @@ def _still(model: Model, point: Point) -> tuple[Still, ...] | None:
     return model.each(of, model.targets, resting)
 
 
-def _placed(model: Model, point: Point, still: tuple[Still, ...], u: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+def _placed(model: Model, point: Point, still: tuple[Still, ...], u: States) -> States:
     """States with the chosen targets at whitened places (T, n) of each recursion."""
 
     def placed(part: Recursion, s: Still, own: jax.Array, x: jax.Array) -> jax.Array:
@@ -117,15 +115,6 @@ def _placed(model: Model, point: Point, still: tuple[Still, ...], u: tuple[jax.A
     return model.each(placed, still, u, point.states)
 
 
-def _densities(
-    model: Model, point: Point, still: tuple[Still, ...], z: jax.Array, u: tuple[jax.Array, ...]
-) -> tuple[jax.Array, ...]:
-    """Log-likelihood (T,) of the rows of each target with the chosen ones at whitened places."""
-    at = At(_placed(model, point, still, u), z, point.levels)
-    return model.by_target(model.by_epoch(model.log_likelihood(at)))
-
-
-States = tuple[jax.Array, ...]
 Look = list[tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
@@ -136,12 +125,12 @@ def _together(model: Model) -> int:
 
 
 @jax.jit
-def _look(model: Model, point: Point, still: tuple[Still, ...], u: tuple[jax.Array, ...]) -> Any:
+def _look(model: Model, point: Point, still: tuple[Still, ...], u: States) -> Any:
     """At `BATCH` whitened places of every target: log density (K, T), its slope (K, T, n) and expected precision."""
 
-    def one(u: tuple[jax.Array, ...]) -> Any:
-        told = _densities(model, point, still, point.z, u)
+    def one(u: States) -> Any:
         at = At(_placed(model, point, still, u), point.z, point.levels)
+        told = model.by_target(model.by_epoch(model.log_likelihood(at)))
         own = model.of_states(model.linearise(at, expected=True))
         J, score = (model.by_target([pair[k] for pair in own]) for k in (0, 1))
         found = []
@@ -159,7 +148,7 @@ class PlaceScores(NamedTuple):
     Where they are asked for, squares and information (M, M) too.
     """
 
-    first: tuple[jax.Array, ...]
+    first: States
     second: jax.Array
     information: jax.Array
 
@@ -243,17 +232,6 @@ def _first(model: Model, point: Point) -> tuple[np.ndarray, ...]:
     return model.each(of, model.targets, point.noises)
 
 
-def _poses(model: Model) -> list[np.ndarray]:
-    """Number (T,) of different stated poses from which each target is seen."""
-    seen: list[list[set[bytes]]] = [[set() for _ in range(T)] for T in model.targets]
-    for b, (_, data, r) in enumerate(model.each_block()):
-        target = np.asarray(model.recursions[r].target)[np.asarray(data.epoch)]
-        pose, there = np.asarray(data.pose), np.asarray(data.mask).any(1)
-        for t, own in zip(target[there], pose[there], strict=True):
-            seen[r][t].add(bytes([b]) + own.tobytes())
-    return [np.array([len(own) for own in part], int) for part in seen]
-
-
 def _curved(model: Model, point: Point, still: tuple[Still, ...]) -> tuple[Still, ...]:
     """Of targets that stand still those seen from few poses, and those where a quadrature is not Laplace's formula."""
     middle = _first(model, point)
@@ -262,27 +240,27 @@ def _curved(model: Model, point: Point, still: tuple[Still, ...]) -> tuple[Still
     rules = []
     for m, (_, _, W) in zip(middle, here, strict=True):
         n = m.shape[1]
-        nodes = np.stack(np.meshgrid(*[x] * n, indexing="ij"), -1).reshape(-1, n)
+        nodes = lattice([x] * n)
         with np.errstate(all="ignore"):
             spread = np.linalg.inv(np.linalg.cholesky(np.nan_to_num(W[0]) + 1e-12 * np.eye(n)))
-        log_w = np.log(np.stack(np.meshgrid(*[w] * n, indexing="ij"), -1).reshape(-1, n) / w.sum()).sum(1)
+        log_w = np.log(lattice([w / w.sum()] * n)).sum(1)
         rules.append((m + np.einsum("tji,kj->kti", spread, nodes), log_w + 0.5 * (nodes**2).sum(1)))
     most = max(len(log_w) for _, log_w in rules)
     looked = _looked(model, point, still, [np.concatenate([u, np.repeat(u[:1], most - len(u), 0)]) for u, _ in rules])
     chosen = []
-    parts = zip(still, rules, looked, here, _poses(model), strict=True)
+    # number (T,) of different stated poses from which each target is seen
+    seen: list[list[set[bytes]]] = [[set() for _ in range(T)] for T in model.targets]
+    for b, (_, data, r) in enumerate(model.each_block()):
+        target = np.asarray(model.recursions[r].target)[np.asarray(data.epoch)]
+        pose, there = np.asarray(data.pose), np.asarray(data.mask).any(1)
+        for t, own in zip(target[there], pose[there], strict=True):
+            seen[r][t].add(bytes([b]) + own.tobytes())
+    parts = zip(still, rules, looked, here, [np.array([len(own) for own in part], int) for part in seen], strict=True)
     for s, (_, log_w), (f, _, _), (top, _, _), poses in parts:
         off = np.abs(np.logaddexp.reduce(f[: len(log_w)] - top + log_w[:, None], axis=0))
         few = poses <= s.mean.shape[1] + FEW
         chosen.append(s._replace(on=jax.device_put(np.asarray(s.on) & (poses > 0) & (few | (off > OFF)))))
     return tuple(chosen)
-
-
-def _halved(cells: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each cell (m, n) cut in two along every axis."""
-    n = cells.shape[1]
-    corner = np.stack(np.meshgrid(*[[-0.25, 0.25]] * n, indexing="ij"), -1).reshape(-1, n)
-    return (cells[:, None] + width[:, None, None] * corner).reshape(-1, n), np.repeat(0.5 * width, len(corner))
 
 
 class _Target:
@@ -295,7 +273,7 @@ class _Target:
         n, self.mode = len(mode), mode
         top = top if np.abs(mode).max() <= REACH else -np.inf  # the grid does not reach it
         axis = REACH * (2 * np.arange(FIRST[n]) + 1 - FIRST[n]) / FIRST[n]
-        self.cells = np.stack(np.meshgrid(*[axis] * n, indexing="ij"), -1).reshape(-1, n)
+        self.cells = lattice([axis] * n)
         self.width = np.full(len(self.cells), 2 * REACH / FIRST[n])
         self.best, self.most = top, max(min(CELLS, int(WORK / max(rows, 1) / 2**n)), 32)
         self.kept: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
@@ -314,7 +292,9 @@ class _Target:
         self.kept.append((self.cells[ready], self.width[ready], f[ready]))
         again = np.flatnonzero(near & wide)
         again = again[np.argsort(-np.where(around, np.inf, f + rise)[again], kind="stable")[: self.most]]
-        self.cells, self.width = _halved(self.cells[again], self.width[again])
+        corner, width = lattice([[-0.25, 0.25]] * g.shape[1]), self.width[again]
+        self.cells = (self.cells[again][:, None] + width[:, None, None] * corner).reshape(-1, g.shape[1])
+        self.width = np.repeat(0.5 * width, len(corner))
 
     def nodes(self) -> tuple[np.ndarray, np.ndarray]:
         """Places (m, n) and log weights (m,)."""

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from probcal.gaussian.scans import filter_roots, in_parallel, inverse_root, recur, recur_squared
-from probcal.linalg import forward, multiply_rows, semi_cholesky
+from probcal.linalg import forward, multiply_rows, preceding, semi_cholesky
 
 
 class Gains(NamedTuple):
@@ -77,7 +77,7 @@ def predict(F: jax.Array, gain: Gains, b: jax.Array, c: jax.Array | None = None,
     if c is not None:
         source = source.at[:, :, : c.shape[2]].add(gain.keep @ c)
     filtered = recur(gain.keep @ F, source)
-    states = F @ jnp.concatenate([jnp.zeros_like(filtered[:1]), filtered[:-1]])
+    states = F @ preceding(filtered)
     if c is not None:
         states = states.at[:, :, : c.shape[2]].add(c)
     innovation = alone - gain.data.mT @ states
@@ -110,22 +110,18 @@ def innovate(F: jax.Array, gain: Gains, b: jax.Array, c: jax.Array | None = None
     sensor does no harm.
     """
     if c is None and not in_parallel():
-        return _innovate_driftless(F, gain, b)
+        # `innovate` without drifts, epoch by epoch: no state of a column is ever written
+        alone, n = gain.solve @ b, F.shape[1]
+        onward = jnp.concatenate([gain.keep @ F, gain.gain], 2)
+        seen = jnp.concatenate([-(gain.whiten @ (gain.data.mT @ F)), gain.whiten], 2)
+
+        def step(x: jax.Array, epoch: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+            onward_k, seen_k, y = epoch
+            return multiply_rows(onward_k, [*x, *y]), multiply_rows(seen_k, [*x, *y])
+
+        return alone, jax.lax.scan(step, jnp.zeros((n, b.shape[2]), b.dtype), (onward, seen, alone))[1]
     found = predict(F, gain, b, c)
     return found.alone, gain.whiten @ found.innovation
-
-
-def _innovate_driftless(F: jax.Array, gain: Gains, b: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """`innovate` without drifts, epoch by epoch: no state of a column is ever written."""
-    alone, n = gain.solve @ b, F.shape[1]
-    onward = jnp.concatenate([gain.keep @ F, gain.gain], 2)
-    seen = jnp.concatenate([-(gain.whiten @ (gain.data.mT @ F)), gain.whiten], 2)
-
-    def step(x: jax.Array, epoch: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
-        onward_k, seen_k, y = epoch
-        return multiply_rows(onward_k, [*x, *y]), multiply_rows(seen_k, [*x, *y])
-
-    return alone, jax.lax.scan(step, jnp.zeros((n, b.shape[2]), b.dtype), (onward, seen, alone))[1]
 
 
 @jax.jit
@@ -140,8 +136,7 @@ def covariances(F: jax.Array, L: jax.Array, gain: Gains) -> tuple[jax.Array, jax
     back = _next(gain.back)
     own = square((eye - back @ _next(F)) @ gain.updated, back @ _next(L))
     states = recur_squared(back, own, reverse=True)
-    before = jnp.concatenate([jnp.zeros_like(gain.updated[:1]), gain.updated[:-1]])
-    noises = square(gain.drive @ (F @ before), eye - gain.drive @ L)
+    noises = square(gain.drive @ (F @ preceding(gain.updated)), eye - gain.drive @ L)
     return states, noises + gain.drive @ states @ gain.drive.mT
 
 

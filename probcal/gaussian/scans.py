@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from probcal.linalg import forward, multiply, observe, regress_rows, tria
+from probcal.linalg import forward, multiply, observe, preceding, regress_rows, tria
 
 PARALLEL: bool | None = None  # None: wherever the backend is no CPU; read where a kernel is traced
 
@@ -76,7 +76,7 @@ def filter_roots(F: jax.Array, L: jax.Array, data: jax.Array) -> FilterPass:
 
     if in_parallel():
         before = _updated(F, L, data)
-        return jax.vmap(step)(jnp.concatenate([jnp.zeros_like(before[:1]), before[:-1]]), (F, L, data))[1]
+        return jax.vmap(step)(preceding(before), (F, L, data))[1]
     return jax.lax.scan(step, jnp.zeros((n, n), F.dtype), (F, L, data))[1]
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from ctypes import CDLL
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -142,7 +142,7 @@ def _joined(below: list[np.ndarray]) -> tuple[list[np.ndarray], list[tuple[int, 
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """NumPy's OpenBLAS on one thread: most fronts are so small that several wait for each other."""
-    library: Any = CDLL(np.linalg._umath_linalg.__file__)
+    library = CDLL(np.linalg._umath_linalg.__file__)
     known = hasattr(library, "scipy_openblas_set_num_threads64_")  # of NumPy's own wheels
     before = library.scipy_openblas_get_num_threads64_() if known else 1
     if before > 1:

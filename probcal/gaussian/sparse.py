@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,8 @@ from probcal.gaussian.linearised import GivenBiases, given_biases, linearise_row
 from probcal.gaussian.marginal import volume_slope
 from probcal.gaussian.mode import Eliminated, Point, factors, inverse_factors
 from probcal.model.model import Model
-from probcal.model.rows import Linearised
+from probcal.model.rows import LinearRows
+from probcal.model.trajectories import States
 from probcal.simulate import chance_of
 
 WHOLE = 600  # biases up to which a matrix of all is made on request (its eigenvalues take 0.2 s)
@@ -36,14 +37,14 @@ class SparseEngine(Engine):
     # of the last form of a model
     _patterns: list[tuple[list[Any], JointPrecision]] = field(default_factory=list, compare=False)
 
-    cheap: ClassVar[bool] = False
+    cheap = False
 
     @property
     def exact(self) -> bool:
         """True where log determinants and variances are exact."""
         return self.library.exact
 
-    def at(self, model: Model, point: Point, rows: tuple[Linearised, ...] | None = None) -> SparseExpansion:
+    def at(self, model: Model, point: Point, rows: LinearRows | None = None) -> SparseExpansion:
         """The posterior at a consistent point; rows as the caller linearised them."""
         form = jax.tree.leaves(replace(model, recursions=tuple(own._replace(tails=()) for own in model.recursions)))
         kept = self._patterns[0][0] if self._patterns else ()
@@ -74,7 +75,7 @@ class SparseExpansion:
 
     model: Model
     point: Point
-    rows: tuple[Linearised, ...]
+    rows: LinearRows
     joint: JointPrecision
     library: Library
     _kept: list[_Solved] = field(default_factory=list)
@@ -98,7 +99,7 @@ class SparseExpansion:
         return given_biases(self.model, self.point.levels, self.eliminated)
 
     @cached_property
-    def held_states(self) -> tuple[jax.Array, ...]:
+    def held_states(self) -> States:
         """Covariance (E, n, n) of every state of each recursion, the biases known."""
         return _held_states(self.model, self.point, self.eliminated)
 
@@ -248,12 +249,12 @@ class SparseExpansion:
 
 
 @jax.jit
-def _held_states(model: Model, point: Point, held: Eliminated) -> tuple[jax.Array, ...]:
+def _held_states(model: Model, point: Point, held: Eliminated) -> States:
     return model.each(lambda part, kept: rec.covariances(part.F, factors(part, point.levels), kept.gain)[0], held.parts)
 
 
 @jax.jit
-def _followed(model: Model, point: Point, rows: tuple[Linearised, ...], held: Eliminated, dz: jax.Array) -> Point:
+def _followed(model: Model, point: Point, rows: LinearRows, held: Eliminated, dz: jax.Array) -> Point:
     """Tracks at their smoothed response to a step of the biases, by columns of the rows: no (E, n,
     M) is made."""
     columns = model.onto_states(rows, times_weights(model, rows, model.by_bias(rows, -dz[:, None])))
@@ -268,7 +269,7 @@ def _followed(model: Model, point: Point, rows: tuple[Linearised, ...], held: El
 
 
 @jax.jit
-def _relaxed(model: Model, point: Point, rows: tuple[Linearised, ...], held: Eliminated) -> jax.Array:
+def _relaxed(model: Model, point: Point, rows: LinearRows, held: Eliminated) -> jax.Array:
     """Slope (M,) of the log-likelihood by the biases with every track at its mode."""
     free = _followed(model, point, rows, held, jnp.zeros_like(point.z))
     away = [(after - before)[:, :, None] for _, after, before in model.each_layout(free.states, point.states)]

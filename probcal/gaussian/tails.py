@@ -23,7 +23,8 @@ from probcal.gaussian.jointly import follow_biases
 from probcal.gaussian.linearised import marginal_variances
 from probcal.gaussian.mode import Point
 from probcal.model.model import Data, Mixing, Model, Recursion
-from probcal.model.rows import Linearised
+from probcal.model.rows import LinearRows
+from probcal.model.trajectories import States
 from probcal.problem import Problem
 
 ROUNDS, STILL = 50, 1e-3  # of precisions and trajectories in turn, and change of log precision at which they end
@@ -33,7 +34,7 @@ class Variances(NamedTuple):
     """Posterior variances at a point, from which noise levels and precisions follow."""
 
     predicted: Data  # (N, C) of each predicted value
-    noises: tuple[jax.Array, ...]  # (E, n) of each whitened noise
+    noises: States  # (E, n) of each whitened noise
 
     @classmethod
     def of(cls, at: Expansion, factors: Factors) -> "Variances":
@@ -54,7 +55,7 @@ def renewed_noise(model: Model, point: Point, variances: Variances) -> tuple[Mod
     return model.with_mixing(weights), rewhitened(model, point, weights)
 
 
-def expected_mixing(model: Model, point: Point, variances: tuple[jax.Array, ...]) -> Mixing:
+def expected_mixing(model: Model, point: Point, variances: States) -> Mixing:
     """Mean precisions (E,) of every tail, for variances (E, n) of the whitened noises."""
 
     def means(part: Recursion, u: jax.Array, variance: jax.Array) -> tuple[jax.Array, ...]:
@@ -79,7 +80,13 @@ def settle(engine: Engine, problem: Problem, point: Point, root: Any) -> tuple[P
     root root', root (M, R)."""
     for _ in range(ROUNDS if problem.model.tailed else 0):
         at = engine.settled(problem.model, point)
-        point, weights = at.point, expected_mixing(problem.model, at.point, driven_by(at, root))
+        # variance (E, n) of every whitened noise, biases of the covariance root root', root (M, R)
+        gains = tuple(kept.gain for kept in at.eliminated.parts)
+        found = tuple(own.spread for own in at.given_biases())
+        for start in range(0, root.shape[1], COLUMNS):
+            own = root[:, start : start + COLUMNS]
+            found = _driven(at.model, at.rows, gains, found, own @ np.eye(own.shape[1]))
+        point, weights = at.point, expected_mixing(problem.model, at.point, found)
         pairs = zip(jax.tree.leaves(problem.model.mixing), jax.tree.leaves(weights), strict=True)
         moved = max(float(np.abs(np.log(np.asarray(b) / np.asarray(a))).max(initial=0.0)) for a, b in pairs)
         point, problem = rewhitened(problem.model, point, weights), problem.with_mixing(weights)
@@ -88,19 +95,7 @@ def settle(engine: Engine, problem: Problem, point: Point, root: Any) -> tuple[P
     return problem, point
 
 
-def driven_by(at: Expansion, root: Any) -> tuple[jax.Array, ...]:
-    """Variance (E, n) of every whitened noise, biases of the covariance root root', root (M, R)."""
-    gains = tuple(kept.gain for kept in at.eliminated.parts)
-    found = tuple(own.spread for own in at.given_biases())
-    for start in range(0, root.shape[1], COLUMNS):
-        own = root[:, start : start + COLUMNS]
-        found = _driven(at.model, at.rows, gains, found, own @ np.eye(own.shape[1]))
-    return found
-
-
 @jax.jit
-def _driven(
-    model: Model, rows: tuple[Linearised, ...], gains: Any, found: tuple[jax.Array, ...], columns: Any
-) -> tuple[jax.Array, ...]:
+def _driven(model: Model, rows: LinearRows, gains: Any, found: States, columns: Any) -> States:
     moved = follow_biases(model, rows, gains, columns)
     return jax.tree.map(lambda own, by: own + jnp.sum(by.noises**2, 2), found, moved)

@@ -16,7 +16,7 @@ from probcal.identifiability.patterns import DILATION, Pattern, cause, common_sh
 from probcal.identifiability.remedies import TRIED, WEAK, Direction, with_remedies
 from probcal.identifiability.spaces import complete, inside, orthonormal, readable
 from probcal.identifiability.wording import amount, in_words, involved, name_without_owner, owner_of
-from probcal.linalg import invert, least_squares, marginalise, spectrum
+from probcal.linalg import invert, least_squares, marginalise, outer, spectrum
 from probcal.problem import Problem
 from probcal.results.blocks import SensorBlocks
 
@@ -129,7 +129,15 @@ class _Naming:
         others = involved(self.labels, along, np.abs(vector).max())
         words, remedy, anchors = pattern.words, pattern.remedy, pattern.anchors
         if any(pattern is rigid for rigid in self.rigid):  # range scales in a dilation, pitch and roll in a rotation
-            moved = self._moved_along(along, np.abs(vector).max())
+            # components other than those of a pattern that a direction moves most, by name
+            most: dict[str, float] = {}
+            for label, size in zip(self.labels, np.abs(along), strict=True):
+                most[name_without_owner(label)] = max(most.get(name_without_owner(label), 0.0), float(size))
+            moved = [
+                name
+                for name, size in most.items()
+                if size > max(ALONG * np.abs(vector).max(), 0.5 * max(most.values()))
+            ]
             if moved:
                 words += f" and the {' and '.join(name.replace('_', ' ') for name in moved)}s with them"
                 anchors = (*anchors, *((label,) for label in self.labels if name_without_owner(label) in moved))
@@ -140,13 +148,6 @@ class _Naming:
         self.found.append(Direction(pattern.name, words, kind, strength, whole, others, remedy))
         own = (tuple(label for label in group if label in self.labels) for group in anchors)  # a survey is not fixed
         self.anchors.append(tuple(group for group in own if group))
-
-    def _moved_along(self, along: np.ndarray, largest: float) -> list[str]:
-        """Components other than those of a pattern that a direction moves most, by name."""
-        most: dict[str, float] = {}
-        for label, size in zip(self.labels, np.abs(along), strict=True):
-            most[name_without_owner(label)] = max(most.get(name_without_owner(label), 0.0), float(size))
-        return [name for name, size in most.items() if size > max(ALONG * largest, 0.5 * max(most.values()))]
 
     def _combination(self, vector: np.ndarray) -> Pattern:
         return combination(self.problem, self.labels, vector, self.cause)
@@ -194,13 +195,16 @@ def shared_directions(problem: Problem, at: Expansion) -> tuple[Direction, ...]:
     if not patterns:
         return ()
     moved = np.asarray(at.solve(scales, np.stack([vector for _, vector in patterns], 1)))
+    free = {label: m for m, label in enumerate(problem.labels) if not problem.surveyed[m]}
     found, anchors = list[Direction](), list[tuple[tuple[str, ...], ...]]()
     for (pattern, vector), along in zip(patterns, moved.T, strict=True):
         information = max(1.0 / float(vector @ along) - 1.0, 0.0)
         if information < WEAK:
             unit = along / np.linalg.norm(along)
             found.append(Direction(pattern.name, pattern.words, "weak", information, unit, (), pattern.remedy))
-            anchors.append(_strongest(problem, pattern.anchors, unit))
+            groups = [tuple(label for label in group if label in free) for group in pattern.anchors]
+            sizes = {group: sum(unit[free[label]] ** 2 for label in group) for group in groups if group}
+            anchors.append(tuple(sorted(sizes, key=sizes.__getitem__, reverse=True)[:TRIED]))
     if not found:
         return ()
     found = with_kinds(problem, at.point, found)
@@ -215,16 +219,6 @@ def with_kinds(problem: Problem, point: Point, found: Sequence[Direction]) -> li
     return [replace(d, kind="gauge" if free else d.kind) for d, free in zip(found, own, strict=True)]
 
 
-def _strongest(
-    problem: Problem, anchors: tuple[tuple[str, ...], ...], vector: np.ndarray
-) -> tuple[tuple[str, ...], ...]:
-    """The free biases of groups of which one is to be fixed, those groups that a direction (M,) moves most."""
-    free = {label: m for m, label in enumerate(problem.labels) if not problem.surveyed[m]}
-    groups = [tuple(label for label in group if label in free) for group in anchors]
-    moved = {group: sum(vector[free[label]] ** 2 for label in group) for group in groups if group}
-    return tuple(sorted(moved, key=lambda group: -moved[group])[:TRIED])
-
-
 def alone_directions(problem: Problem, point: Point, blocks: SensorBlocks) -> tuple[tuple[Direction, ...], int]:
     """Combinations of the biases of single sensors that the data leave to the prior, the weakest first, and how many.
 
@@ -232,7 +226,7 @@ def alone_directions(problem: Problem, point: Point, blocks: SensorBlocks) -> tu
     """
     M, members = len(problem.labels), blocks.members
     free = np.append(~problem.surveyed, False)[members]
-    values, vectors = spectrum(np.where(free[:, :, None] & free[:, None, :], blocks.covariance, 0.0))
+    values, vectors = spectrum(np.where(outer(free), blocks.covariance, 0.0))
     information = 1.0 / np.maximum(values, 1e-300) - 1.0
     weak = np.argwhere(information < WEAK)
     weak = weak[np.argsort(information[tuple(weak.T)], kind="stable")]

@@ -18,7 +18,8 @@ from probcal.linalg import orthogonalise, spectrum
 from probcal.model import variants
 from probcal.model.model import Model
 from probcal.model.motions import by_component, linear_of
-from probcal.model.rows import Linearised
+from probcal.model.rows import LinearRows
+from probcal.model.trajectories import States
 from probcal.motion import Known, as_motion
 from probcal.problem import Problem
 
@@ -33,7 +34,7 @@ class Within(NamedTuple):
 
     left: jax.Array  # (k, k) information about them
     known: jax.Array  # (k,) the same with the states known
-    ranks: tuple[jax.Array, ...]  # (E,) unknowns that the data of an epoch fix
+    ranks: States  # (E,) unknowns that the data of an epoch fix
 
 
 class Gauge(NamedTuple):
@@ -44,7 +45,7 @@ class Gauge(NamedTuple):
 
 
 @jax.jit
-def within(model: Model, lins: tuple[Linearised, ...], hold: tuple[jax.Array, ...], basis: jax.Array) -> Within:
+def within(model: Model, lins: LinearRows, hold: States, basis: jax.Array) -> Within:
     """Information about combinations with free states, from the residuals of rows: no cancellation."""
     own = model.by_bias(lins, basis)
     pulled = tuple(lin.weight[:, :, None] * row for lin, row in zip(lins, own, strict=True))
@@ -61,7 +62,7 @@ def within(model: Model, lins: tuple[Linearised, ...], hold: tuple[jax.Array, ..
     return Within(left, known, tuple(ranks))
 
 
-def held_states(problem: Problem) -> tuple[jax.Array, ...]:
+def held_states(problem: Problem) -> States:
     """Precision (E, n) of the states that are known beforehand: those of `Known` targets."""
     found = []
     for part, epochs in problem.model.each_layout(problem.epochs):

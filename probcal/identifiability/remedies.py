@@ -100,7 +100,7 @@ def _anchor(known: np.ndarray, done: list[int], groups: list[list[int]], left: i
     """
     values, vectors = _spectrum(known, done)
     hold = (vectors[:, values < WEAK] ** 2).sum(1)
-    best: tuple[int, float] = (left, np.inf)
+    best = (left, np.inf)
     chosen: list[int] = []
     for group in sorted(groups, key=lambda group: -hold[group].sum())[:TRIED]:
         values, _ = _spectrum(known, [*done, *group])

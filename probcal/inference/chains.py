@@ -9,17 +9,19 @@ import jax.numpy as jnp
 
 from probcal.devices import over_devices
 from probcal.gaussian.frame import place
-from probcal.gaussian.search import zeros_from
+from probcal.gaussian.search import chosen, zeros_from
+from probcal.inference.draws import accepted
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, conditional, log_prior
 from probcal.inference.sides import Sided, shifted, side_of
+from probcal.model.trajectories import States
 
 
 class Sample(NamedTuple):
     """One draw as a sampler sees it, and what it says about itself."""
 
     theta: jax.Array  # (Q,)
-    eps: tuple[jax.Array, ...]
+    eps: States
     phi: Phi
     joint: jax.Array  # () log density of data and eps given theta
     stats: dict[str, jax.Array]
@@ -32,7 +34,7 @@ class Draw(NamedTuple):
     phi: Phi
     gamma: jax.Array  # (M,) 1 - alpha Sigma given phi
     variance: jax.Array  # (M,) of each z given phi
-    states: tuple[jax.Array, ...]  # (E, n) of each recursion
+    states: States  # (E, n) of each recursion
     density: jax.Array  # () log density of data, eps and theta given phi
     stats: dict[str, jax.Array]
 
@@ -88,9 +90,8 @@ def run_sided(method: Any, form: Form, sides: Posed, state: Sided, thin: jax.Arr
             pick, lot = jax.random.split(own)
             other = (side + 1 + jax.random.randint(pick, (), 0, count - 1)) % count
             moved, gain = way(side_of(sides, side), side_of(sides, other), chain)
-            taken = jnp.log(jax.random.uniform(lot)) < jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
-            pairs = ((moved, other), (chain, side))
-            chain, side = jax.tree.map(lambda new, old, taken=taken: jnp.where(taken, new, old), *pairs)
+            taken = accepted(lot, gain)
+            chain, side = chosen(taken, (moved, other), (chain, side))
             crossed = crossed | taken
         stats = sample.stats | {"side": state.side, "crossed": crossed}
         return Sided(chain, side, key), sample._replace(stats=stats)

@@ -5,7 +5,7 @@ hyper-parameters drawn anew; then a Hamiltonian swing of biases and all trajecto
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,9 @@ import numpy as np
 
 from probcal.errors import InputError
 from probcal.gaussian.frame import log_weight
+from probcal.gaussian.search import chosen
 from probcal.inference.chains import Sample
+from probcal.inference.draws import accepted
 from probcal.inference.framed import FramedSampler
 from probcal.inference.gibbs import draw_hyper
 from probcal.inference.hierarchy import Phi
@@ -21,6 +23,7 @@ from probcal.inference.leaps import Place, leap
 from probcal.inference.orbits import roam
 from probcal.inference.posed import Conditional, Form, Posed, conditional, prior_precision
 from probcal.inference.sampler import Sampler
+from probcal.model.trajectories import States
 from probcal.priors import Horseshoe, Prior
 
 LEAPS = 4  # tries before a swing, which costs more than all of them
@@ -31,15 +34,15 @@ class CollapsedState(NamedTuple):
     """Where a chain stands."""
 
     theta: jax.Array
-    eps: tuple[jax.Array, ...]
+    eps: States
     phi: Phi
     weight: jax.Array  # log weight of theta and eps
     key: jax.Array
 
 
 def hmc_step(
-    form: Form, posed: Posed, chain: CollapsedState, given: Conditional, key: jax.Array
-) -> tuple[jax.Array, tuple[jax.Array, ...], jax.Array, jax.Array]:
+    posed: Posed, chain: CollapsedState, given: Conditional, key: jax.Array
+) -> tuple[jax.Array, States, jax.Array, jax.Array]:
     """Hamiltonian step of theta and eps given phi, a quarter turn in the frame's coordinates.
 
     Returns theta, eps, log weight and whether the step was taken. Its steps are short enough for many epochs that
@@ -84,9 +87,8 @@ def hmc_step(
     first = (free, momentum, pull, (before, chain.weight))
     (last, after, _, (value, weight)), _ = jax.lax.scan(leap, first, None, length=count)
     gain = before + kinetic(momentum) - value - kinetic(after)
-    taken = jnp.log(jax.random.uniform(keys[2])) < jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
-    found = (place(last), last[1], weight), (chain.theta, chain.eps, chain.weight)
-    return *jax.tree.map(lambda new, old: jnp.where(taken, new, old), *found), taken
+    taken = accepted(keys[2], gain)
+    return *chosen(taken, (place(last), last[1], weight), (chain.theta, chain.eps, chain.weight)), taken
 
 
 @dataclass(frozen=True)
@@ -106,12 +108,12 @@ class Collapsed(FramedSampler):
     sweeps: int | None = None
     patience: int = 16
 
-    name: ClassVar[str] = "Collapsed"
-    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
-    atoms: ClassVar[bool] = True
-    crosses: ClassVar[bool] = True
-    roams: ClassVar[bool] = True
-    chunk: ClassVar[int] = 50
+    name = "Collapsed"
+    priors = (Horseshoe, Prior)
+    atoms = True
+    crosses = True
+    roams = True
+    chunk = 50
 
     def __post_init__(self):
         super().__post_init__()
@@ -142,7 +144,7 @@ class Collapsed(FramedSampler):
         )
         phi = draw_hyper(form, at.phi, at.theta, keys[1])
         given = conditional(form, posed, phi)
-        theta, eps, weight, swung = hmc_step(form, posed, chain._replace(**at._asdict()), given, keys[2])
+        theta, eps, weight, swung = hmc_step(posed, chain._replace(**at._asdict()), given, keys[2])
         at, roamed = roam(form, posed, Place(theta, eps, phi, weight), keys[3])
         joint = at.weight + posed.frame.log_likelihood(at.theta) - 0.5 * sum(jnp.sum(e**2) for e in at.eps)
         stats = {"acceptance_rate": rate, "swung": swung, "log_weight": at.weight}

@@ -7,6 +7,7 @@ import jax
 from probcal.gaussian.frame import log_joint
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed, log_prior, prior_precision, whiten
+from probcal.model.trajectories import States
 
 
 class Free(NamedTuple):
@@ -14,7 +15,7 @@ class Free(NamedTuple):
 
     phi: Phi
     eta: jax.Array  # (Q,) of theta given phi
-    eps: tuple[jax.Array, ...]  # (E, n) of the trajectories given theta
+    eps: States  # (E, n) of the trajectories given theta
 
 
 class Parts(NamedTuple):

@@ -24,6 +24,11 @@ def normals(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     return jnp.sqrt(-2.0 * jnp.log1p(-first)) * jnp.cos(2.0 * jnp.pi * second)
 
 
+def accepted(key: jax.Array, gain: jax.Array) -> jax.Array:
+    """Whether proposals whose log densities gain so much are taken (Metropolis)."""
+    return jnp.log(jax.random.uniform(key)) < jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
+
+
 def inverse_gaussian(key: jax.Array, mean: jax.Array, shape: float) -> jax.Array:
     """Inverse Gaussian draws of mean (L,) and a shape (Michael, Schucany, Haas 1976), without cancellation."""
     keys = jax.random.split(key)

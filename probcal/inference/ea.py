@@ -24,7 +24,7 @@ from probcal.inference.method import Context, Given, State
 from probcal.inference.posed import Form
 from probcal.inference.pruned import without_far_modes
 from probcal.inference.relevance import best_precisions
-from probcal.inference.run import KernelClimb, Maximiser, course_of, first_precision, learn, renew_noise, valued
+from probcal.inference.run import KernelClimb, Maximiser, learn, renew_noise, single_course, valued
 from probcal.linalg import library
 from probcal.model.model import Mixing, Model
 from probcal.priors import ARD, Flat, Gaussian, Horseshoe, Laplace, Precision, Prior
@@ -144,8 +144,8 @@ class EA(Maximiser):
     engine: str | Engine = "auto"
     form: InitVar[str] = ""  # the word of versions before for `engine`
 
-    name: ClassVar[str] = "EA"
-    intervals: ClassVar[str] = (
+    name = "EA"
+    intervals = (
         "a mixture over the precisions around the Gaussian likelihood at one point; unknown noise levels are held"
     )
     plugged: ClassVar[str] = (
@@ -186,8 +186,7 @@ class EA(Maximiser):
             return self.climb(problem.with_mixing(mixing), prior, point, context, alpha)[0]
 
         kept = without_far_modes(problem.model, prior, task.given, state, climb)
-        last = jax.tree.map(lambda leaf: np.asarray(leaf)[None], course_of(kept))
-        return kept, course if kept is state else course.and_then(last)
+        return kept, course if kept is state else course.and_then(single_course(kept))
 
     def _tries_again(self, prior: Prior) -> TypeGuard[ARD]:
         """Whether maximised precisions are tried anew after a climb."""
@@ -215,7 +214,7 @@ class EA(Maximiser):
         """Precisions of largest evidence on the Gaussian likelihood at a state, and the nats that they gain."""
         how = Integration(Form(problem.model.biases, hierarchy_of(Gaussian(), problem)), True)
         model = problem.model.with_mixing(state.mixing)
-        known, sound = likelihood(how, model, first_precision(problem, prior), state.point)
+        known, sound = likelihood(how, model, problem.first_precision(prior), state.point)
         if not bool(sound):
             return np.asarray(state.alpha), 0.0
         learnt, members = np.flatnonzero(~held(prior, problem)).tolist(), problem.members
@@ -290,9 +289,9 @@ class MAP(Maximiser):
     engine: str | Engine = "auto"
     form: InitVar[str] = ""  # the word of versions before for `engine`
 
-    name: ClassVar[str] = "MAP"
+    name = "MAP"
     priors: ClassVar[tuple[type, ...]] = (Gaussian, Flat, Laplace)
-    intervals: ClassVar[str] = "Laplace: exact for a Gaussian or flat prior where the problem is linear and Gaussian"
+    intervals = "Laplace: exact for a Gaussian or flat prior where the problem is linear and Gaussian"
 
     def __post_init__(self, form: str) -> None:
         if self.trajectory not in MODES:
@@ -320,8 +319,8 @@ class LeastSquares(MAP):
 
     trajectory: str = "joint"
 
-    name: ClassVar[str] = "least squares"
-    priors: ClassVar[tuple[type, ...]] = (Flat,)
+    name = "least squares"
+    priors = (Flat,)
 
     def __post_init__(self, form: str) -> None:
         if self.trajectory != "joint":

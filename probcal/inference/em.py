@@ -22,7 +22,7 @@ from probcal.inference.engined import Engined
 from probcal.inference.loop import Pause, Trace
 from probcal.inference.method import Context, Given, MethodTask, ParticleSmoother, State
 from probcal.inference.mixture import gaussian_at
-from probcal.inference.run import KernelClimb, Maximiser, course_of, learn, stepped, valued
+from probcal.inference.run import KernelClimb, Maximiser, learn, single_course, stepped, valued
 from probcal.model.model import Model
 from probcal.model.variants import biases_alone
 from probcal.priors import ARD, Flat, Gaussian, Laplace, Precision, Prior
@@ -125,12 +125,12 @@ def _valued(model: Model, prior: Prior, given: Given, state: State) -> State:
 class EngineEM(Engined, KernelClimb):
     """EM on any engine: trajectories by kernels, the biases and their covariance by the engine."""
 
-    whole: ClassVar[bool] = False
+    whole = False
 
     def step(self, state: State, count: int, pause: Pause) -> tuple[State, Trace]:
         """One iteration."""
         state = stepped(self, self.model, self.bare, self.given, state)
-        return state, jax.tree.map(lambda leaf: np.asarray(leaf)[None], course_of(state))
+        return state, single_course(state)
 
     def iterate(self, model: Model, prior: Prior, given: Given, state: State) -> State:
         """Inner EM steps, then new precisions."""
@@ -174,9 +174,9 @@ class EM(Maximiser):
     inner: int = 1
     engine: str | Engine = "auto"
 
-    name: ClassVar[str] = "EM"
+    name = "EM"
     priors: ClassVar[tuple[type, ...]] = (Gaussian, Flat, Laplace)
-    intervals: ClassVar[str] = "Laplace: exact for a Gaussian or flat prior where the problem is linear and Gaussian"
+    intervals = "Laplace: exact for a Gaussian or flat prior where the problem is linear and Gaussian"
 
     def __post_init__(self):
         if not isinstance(self.e_step, EStep | ParticleSmoother):
@@ -235,6 +235,6 @@ class EMEA(EM):
     iterations: int = 50
     tolerance: float = 0.0
 
-    name: ClassVar[str] = "EM-EA"
-    priors: ClassVar[tuple[type, ...]] = (ARD,)
-    intervals: ClassVar[str] = "plug-in: the precisions are taken as known, so the intervals are too narrow"
+    name = "EM-EA"
+    priors = (ARD,)
+    intervals = "plug-in: the precisions are taken as known, so the intervals are too narrow"

@@ -25,7 +25,7 @@ from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, Posterior, Summary, uncalibrated
 from probcal.results.blocks import SensorBlocks
-from probcal.results.groups import datum_of, gather
+from probcal.results.groups import data_columns, datum_of, gather
 from probcal.status import CLIMB, judge
 
 NAMED = 20  # biases that no row tells, of which a message says so
@@ -59,7 +59,7 @@ def conclude(
         covariance, information = SensorBlocks.of(np.asarray(state.found.covariance)), state.found.information
         posterior = gaussian(problem, prior, state.point, covariance, alpha, information=information, evidence=worth)
     else:
-        alpha = np.asarray(prior.precision(problem.labels, problem.surveyed).alpha)
+        alpha = np.asarray(problem.first_precision(prior).alpha)
         posterior = mixture(problem, prior, how.form, alpha, mixed, worth)
     answer = conclude_at(
         problem, method, prior, posterior, course, evidence=worth, stopped=stopped,
@@ -199,7 +199,7 @@ def _points(problem: Problem, point: Point, square: float) -> Iterator[Point]:
 def _remains(problem: Problem, point: Point) -> MisfitData:
     """The residual of every datum at a point, and where it belongs."""
     network, (datum, picks) = problem.network, datum_of(problem)
-    names = {name: values for name, (_, values) in datum["coords"].items()}
+    names = data_columns(datum)
     units = {
         (placed.name, channel): known.unit
         for placed in network.sensors

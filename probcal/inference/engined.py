@@ -59,7 +59,7 @@ class Engined(MethodTask):
 
     def singular(self, error: np.linalg.LinAlgError) -> Answer:
         """Raises that the fit diverged, and which biases no row informs."""
-        problem, own = self.problem, self.prior.precision(self.problem.labels, self.problem.surveyed)
+        problem, own = self.problem, self.problem.first_precision(self.prior)
         at = self.engine.at(problem.model, self.start)
         raise diverged(problem, at, Factors.of(own)) from None
 
@@ -87,7 +87,7 @@ class HostClimb(Engined):
         cls, method: Any, problem: Problem, prior: Prior, start: Point, context: Context, engine: Engine
     ) -> HostClimb:
         """The climb of a method that reports a Gaussian, or a mixture, at the mode."""
-        scales = method.climbs_under(prior).precision(problem.labels, problem.surveyed)
+        scales = problem.first_precision(method.climbs_under(prior))
         own = method.iterations, method.tolerance, method.integrates_places
         return cls(method, problem, prior, start, context, scales, Factors.of(scales), *own, engine=engine)
 
@@ -166,7 +166,7 @@ class HostClimb(Engined):
         if self.model.rests and self.marginal:
             end, settled = with_places(climb, end, engine, lambda: context.monitor.stopped)
         problem, at, (state, course) = end.problem, end.at, end.state
-        first, how = prior.precision(problem.labels, problem.surveyed), method.integration(problem, prior)
+        first, how = problem.first_precision(prior), method.integration(problem, prior)
         worth = evidence(at, self.scales, self.factors)
         if how is None:
             posterior = gaussian_at(problem, prior, at, worth)

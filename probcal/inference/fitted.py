@@ -18,15 +18,16 @@ from probcal.gaussian.mode import Point
 from probcal.gaussian.places import tilt_at
 from probcal.lazy import pd, xr
 from probcal.linalg import invert
-from probcal.model.model import Recursion
+from probcal.model.model import Data, Recursion
 from probcal.model.motions import level_logs
-from probcal.model.rows import Linearised
+from probcal.model.rows import LinearRows
+from probcal.model.trajectories import States
 from probcal.modes.grid import follow_states, track_mode
 from probcal.priors import Precision
 from probcal.problem import Epochs, Problem
 from probcal.results.answer import blocks_under
 from probcal.results.blocks import SensorBlocks
-from probcal.results.groups import datum_of, gather, weights_of_tails
+from probcal.results.groups import data_columns, datum_of, gather, weights_of_tails
 from probcal.results.read import each_track, saved_by_epoch
 
 COLUMNS = 16  # bias directions that are filtered together
@@ -51,13 +52,22 @@ class Judged:
         return self.expansion.point
 
     @property
-    def lins(self) -> tuple[Linearised, ...]:
+    def lins(self) -> LinearRows:
         """The rows linearised there with the expected information."""
         return self.expansion.rows
 
     def flat(self, parts: Any) -> np.ndarray:
         """Arrays (..., N, C) of the blocks as one (..., data)."""
         return gather([np.asarray(part) for part in parts], self.picks)
+
+    def in_blocks(self, values: np.ndarray) -> Data:
+        """Values by datum (data, K) as those of the blocks (N, C, K), zero where nothing is measured."""
+        found, parts = [], np.split(values, np.cumsum([len(rows) for rows, _ in self.picks])[:-1])
+        for there, pick, own in zip(self.problem.model.measured, self.picks, parts, strict=True):
+            block = np.zeros((*there.shape, values.shape[1]))
+            block[pick] = own
+            found.append(jax.device_put(block))
+        return tuple(found)
 
     @property
     def factors(self) -> Factors:
@@ -139,11 +149,19 @@ def take_up(problem: Problem, fit: xr.DataTree) -> Judged:
     problem = problem if "block" in group else problem.padded()
     problem = problem.unlinked() if fit.attrs.get("motion") == "left out" else problem.untilted
     problem = problem.retimed(group["mean"].values / problem.scales)
-    problem = _weighted(problem, dict(each_track(fit)))
+    tracked = dict(each_track(fit))
+
+    # the problem with the precisions of its process noise that the tracks of a tree hold
+    def saved(part: Recursion, epochs: Epochs) -> States:
+        names = weights_of_tails(part)
+        own = [saved_by_epoch(epochs, tracked, name, "process noise") for name in names]
+        return tuple(jax.device_put(np.where(epochs.target == "", 1.0, weight)) for weight in own)
+
+    problem = problem.with_mixing(problem.model.each(saved, problem.epochs))
     datum, picks = datum_of(problem)
     if not np.array_equal(datum["y"], fit["observed_data"].to_dataset()["y"].values):
         raise InputError("assess: the tree was fitted to other data; give the problem as it was fitted")
-    data = pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()})
+    data = pd.DataFrame(data_columns(datum))
     spread = SensorBlocks.read(group, problem.labels, "assess", problem.scales)
     asked = "dense" if "block" not in group else "iterative" if "sd_error" in group else factoriser()
     engine, point = engine_of(asked, problem.model), point_of(problem, fit, group)
@@ -160,17 +178,6 @@ def on_several_sides(fit: xr.DataTree) -> bool:
     """Whether the draws of a tree lie on several sides of a mirror."""
     stats = fit["sample_stats"].to_dataset() if "sample_stats" in fit.children else {}
     return "side" in stats and bool(np.ptp(stats["side"].values))
-
-
-def _weighted(problem: Problem, tracked: dict[str, xr.Dataset]) -> Problem:
-    """The problem with the precisions of its process noise that the tracks of a tree hold."""
-
-    def saved(part: Recursion, epochs: Epochs) -> tuple[jax.Array, ...]:
-        names = weights_of_tails(part)
-        own = [saved_by_epoch(epochs, tracked, name, "process noise") for name in names]
-        return tuple(jax.device_put(np.where(epochs.target == "", 1.0, weight)) for weight in own)
-
-    return problem.with_mixing(problem.model.each(saved, problem.epochs))
 
 
 def point_of(problem: Problem, fit: xr.DataTree, group: xr.Dataset) -> Point:

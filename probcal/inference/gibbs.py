@@ -50,7 +50,7 @@ def gibbs_sweep(
             phi = update_inclusions(form, posed, phi, jax.random.fold_in(key, 1), backwards=backwards)
         return draw_given(form, posed, phi, key), phi
 
-    steps: list[Any] = [lambda t, p, s, k=k: hyper(k, t, p, s) for k in range(len(kind.updates()))] + [biases]
+    steps = [lambda t, p, s, k=k: hyper(k, t, p, s) for k in range(len(kind.updates()))] + [biases]
     for step, own in zip(steps[::-1] if backwards else steps, jax.random.split(key, len(steps)), strict=True):
         theta, phi = step(theta, phi, own)
     return theta, phi

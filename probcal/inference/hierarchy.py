@@ -65,8 +65,13 @@ class Hierarchy(ABC):
         raise AssertionError("no bias of this prior can be exactly zero")
 
     def belongs(self, name: str) -> str:
-        """Whose a hyper-parameter is: of each "bias" that is governed, of each "group" of them, or of "all"."""
-        return "bias" if name in self.by_bias else "all"
+        """Whose a hyper-parameter is: of each governed "bias", of each "group" of them, or of "all".
+
+        The own ones of groups are those of the biases where each bias is a group of its own.
+        """
+        if name == self.own and self.group != tuple(range(len(self.learnt))):
+            return "group"
+        return "bias" if name in (self.own, *self.by_bias) else "all"
 
     def variables(self, labels: Sequence[str], phi: Mapping[str, Any]) -> dict[str, Any]:
         """Hyper-parameters by draw for biases of these labels: name -> (dims beyond chain and draw, values, coords)."""
@@ -186,10 +191,6 @@ class GammaPrecision(Hierarchy):
 
     own = "alpha"
 
-    def belongs(self, name):
-        """Precisions are those of groups; where each bias is a group of its own, of the biases."""
-        return "bias" if self.group == tuple(range(len(self.learnt))) else "group"
-
     def hyper(self):
         """Precisions, (groups,)."""
         return {"alpha": dist.Gamma(self.prior.shape * jnp.ones(self.count), self.prior.rate)}
@@ -218,7 +219,6 @@ class GammaPrecision(Hierarchy):
 class LaplaceMixture(Hierarchy):
     """Laplace density as a Gaussian of exponential variance (Park, Casella 2008)."""
 
-    by_bias = ("variance",)
     own = "variance"
 
     def hyper(self):
@@ -249,29 +249,28 @@ class RegularisedHorseshoe(Hierarchy):
 
     own = "local_scale"
 
-    def belongs(self, name):
-        """Local scales are those of groups; where each bias is a group of its own, of the biases."""
-        if name != "local_scale":
-            return "all"
-        return "bias" if self.group == tuple(range(len(self.learnt))) else "group"
+    @property
+    def _widths(self) -> tuple[float, float, float]:
+        """Width of the global scale; shape and scale of the slab variance."""
+        half = 0.5 * self.prior.slab_df
+        return self.prior.expected / (1.0 - self.prior.expected), half, half * self.prior.slab_scale**2
 
     def hyper(self):
         """Local scales (groups,), global scale, slab variance; in declared scales."""
-        half = 0.5 * self.prior.slab_df
+        width, half, slab = self._widths
         return {
             "local_scale": dist.HalfCauchy(jnp.ones(self.count)),
-            "global_scale": dist.HalfCauchy(self.prior.expected / (1.0 - self.prior.expected)),
-            "slab_variance": dist.InverseGamma(half, half * self.prior.slab_scale**2),
+            "global_scale": dist.HalfCauchy(width),
+            "slab_variance": dist.InverseGamma(half, slab),
         }
 
     def drawn(self):
         """Half-Cauchy by the modulus, inverse Gamma by the reciprocal."""
-        width = self.prior.expected / (1.0 - self.prior.expected)
-        half = 0.5 * self.prior.slab_df
+        width, half, slab = self._widths
         return {
             "local_scale": lambda key: jnp.abs(jax.random.cauchy(key, (self.count,))),
             "global_scale": lambda key: jnp.abs(width * jax.random.cauchy(key)),
-            "slab_variance": lambda key: half * self.prior.slab_scale**2 / jax.random.gamma(key, half),
+            "slab_variance": lambda key: slab / jax.random.gamma(key, half),
         }
 
     def governed(self, phi):
@@ -281,8 +280,7 @@ class RegularisedHorseshoe(Hierarchy):
 
     def updates(self):
         """Local scales by the auxiliary form (Makalic, Schmidt 2016) made exact for the slab; the others by slices."""
-        width = self.prior.expected / (1.0 - self.prior.expected)
-        half = 0.5 * self.prior.slab_df
+        width, half, scale = self._widths
         group = jnp.asarray(self.group)
         members = np.bincount(self.group, minlength=self.count)
 
@@ -314,7 +312,7 @@ class RegularisedHorseshoe(Hierarchy):
         def density(z: jax.Array, local: jax.Array, logs: jax.Array) -> jax.Array:
             tau, slab = jnp.exp(logs)
             alpha = jnp.clip(1.0 / slab + 1.0 / (tau * local[group]) ** 2, LEAST, MOST)
-            own = logs[0] - jnp.log1p((tau / width) ** 2) - half * logs[1] - half * self.prior.slab_scale**2 / slab
+            own = logs[0] - jnp.log1p((tau / width) ** 2) - half * logs[1] - scale / slab
             return own + 0.5 * jnp.sum(jnp.log(alpha) - alpha * z**2)
 
         def shared(phi: Phi, z: jax.Array, key: jax.Array) -> Phi:
@@ -560,7 +558,7 @@ def hierarchy_of(prior: Prior, problem: Problem) -> Hierarchy:
                 ' give ARD(rate=0.5) ("ard-gamma") or Horseshoe()'
             )
         groups = np.unique(one.groups(problem.members)[learnt], return_inverse=True)[1]
-        own: Any = replace(one, correlation=prior.correlation)
+        own = replace(one, correlation=prior.correlation)
         word = re.sub(r"\W+", "_", name).strip("_")
         found.append((word, kind(own, tuple(learnt.tolist()), tuple(int(g) for g in groups))))
     if len(found) == 1:

@@ -18,9 +18,8 @@ from probcal import linalg
 from probcal.gaussian.choose import engine_of
 from probcal.gaussian.engine import Engine, Expansion, Factors
 from probcal.gaussian.joint import blocks_of
-from probcal.gaussian.linearised import compress_and_eliminate, linearise_rows
 from probcal.gaussian.marginal import volume_slope
-from probcal.gaussian.mode import Point, smooth_tracks
+from probcal.gaussian.mode import Point, eliminate, smooth_tracks
 from probcal.gaussian.search import chosen
 from probcal.inference.gibbs import gibbs_sweep
 from probcal.inference.hierarchy import Phi
@@ -97,30 +96,30 @@ def integrate(
     for turn in range(MOVES if search else 1):
         chains, swept = run_sweeps(how.form, known, chains, key, FIRST, BURN, turn * (BURN + KEPT))
         before = point.z
-        point, known = recentred(how, model, point, known, swept.mean)
+        there = point_at(model, point, swept.mean)  # taken unless it has no likelihood
+        after, sound = likelihood(how, model, known.first, there)
+        point, known = chosen(sound, (there, after), (point, known))
         moved = np.subtract(point.z, before) / np.maximum(swept.spread, 1e-9) if search else np.zeros(0)
         if search and np.max(np.abs(moved), initial=0.0) < NEAR:
             break
     if search:
-        return _by_batches(how.form, model, point, known, chains, key)
+        # the mixture of batches of sweeps, taken until their means and sds agree, and its draws from all of them
+        most, kept, found = int(np.clip(WORK // max(how.form.biases, 1) ** 2, 2, BATCHES)), list[Any](), list[Moments]()
+        for k in range(most):
+            chains, swept = run_sweeps(
+                how.form, known, chains, key, KEPT, 0 if k else BURN, (MOVES + k) * (BURN + KEPT)
+            )
+            kept.append(jax.device_get((swept.z, swept.phi)))
+            found.append(jax.device_get(moments(how.form, known, swept.phi)))
+            total, mean_error, sd_error = pooled(found)
+            if k + 1 >= FEWEST and max(np.max(mean_error, initial=0.0), np.max(sd_error, initial=0.0)) < CLOSE:
+                break
+        z, phi = jax.tree.map(lambda *parts: np.concatenate(parts, 1)[:, :: len(parts)], *kept)
+        middle = point_at(model, point, jax.device_put(total.mean))
+        return Integrated(middle, known.information, total, z, phi, True, mean_error, sd_error)
     _, swept = run_sweeps(how.form, known, chains, key, KEPT, BURN, BURN + KEPT)
     total = moments(how.form, known, swept.phi)
     return Integrated(point_at(model, point, total.mean), known.information, total, swept.z, swept.phi)
-
-
-def _by_batches(form: Form, model: Model, point: Point, known: Natural, chains: Any, key: jax.Array) -> Integrated:
-    """The mixture of batches of sweeps, taken until their means and sds agree, and its draws from all of them."""
-    most, kept, found = int(np.clip(WORK // max(form.biases, 1) ** 2, 2, BATCHES)), list[Any](), list[Moments]()
-    for k in range(most):
-        chains, swept = run_sweeps(form, known, chains, key, KEPT, 0 if k else BURN, (MOVES + k) * (BURN + KEPT))
-        kept.append(jax.device_get((swept.z, swept.phi)))
-        found.append(jax.device_get(moments(form, known, swept.phi)))
-        total, mean_error, sd_error = pooled(found)
-        if k + 1 >= FEWEST and max(np.max(mean_error, initial=0.0), np.max(sd_error, initial=0.0)) < CLOSE:
-            break
-    z, phi = jax.tree.map(lambda *parts: np.concatenate(parts, 1)[:, :: len(parts)], *kept)
-    middle = point_at(model, point, jax.device_put(total.mean))
-    return Integrated(middle, known.information, total, z, phi, True, mean_error, sd_error)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what is not finite is no answer, which the status says
@@ -150,7 +149,7 @@ def by_propagation(
     `at` where the climb ended.
     """
     first = form.rest(first)
-    known = BiasLikelihood.of(engine, at, Factors.of(first), marginal=marginal)
+    known = BiasLikelihood(engine, at, Factors.of(first), marginal)
     work = Propagation.of(form, first, known, blocks_of(at.model), context.key)
     work.resume(context.run(work)[0])
     swept, here = work.swept, work.likelihood.here
@@ -167,7 +166,7 @@ def joint_draws(work: Propagation) -> tuple[np.ndarray, SensorBlocks]:
     They are ordered as those of the Gaussian of likelihood and sites are (Iman and Conover 1982).
     """
     swept, factors, here = work.swept, work.factors, work.likelihood.here
-    M, whole = work.form.biases, work.likelihood.whole
+    M, whole = work.form.biases, work.likelihood.engine.cheap  # covariance of all biases is made
     shape = (CHAINS, KEPT if whole else few_draws(M))
     count, rng = shape[0] * shape[1], chance_of(work.key)
     ordered = np.asarray(here.deviations(factors, work.key, count).z)
@@ -183,7 +182,7 @@ def joint_draws(work: Propagation) -> tuple[np.ndarray, SensorBlocks]:
 
 def likelihood(how: Integration, model: Model, first: Precision, point: Point) -> tuple[Natural, jax.Array]:
     """The Gaussian likelihood of the biases at a point, and whether it is one."""
-    _, solved = compress_and_eliminate(model, point, linearise_rows(model, point))
+    solved = eliminate(model, point, expected=True)
     volume, smooth = (
         volume_slope(model, point, solved) if how.marginal else (jnp.zeros_like(point.z), jnp.ones((), bool))
     )
@@ -197,13 +196,6 @@ def likelihood(how: Integration, model: Model, first: Precision, point: Point) -
 def point_at(model: Model, point: Point, z: jax.Array) -> Point:
     """The point at biases z (M,), trajectories at their mode."""
     return smooth_tracks(model, point._replace(z=z))
-
-
-def recentred(how: Integration, model: Model, point: Point, known: Natural, mean: jax.Array) -> tuple[Point, Natural]:
-    """Point and likelihood at a mean (M,); as they were where there is no likelihood at the mean."""
-    moved = point_at(model, point, mean)
-    after, sound = likelihood(how, model, known.first, moved)
-    return chosen(sound, (moved, after), (point, known))
 
 
 def begin(form: Form) -> tuple[Any, Any]:
@@ -250,8 +242,7 @@ def moments(form: Form, known: Natural, phi: Phi) -> Moments:
 
     def add(total: jax.Array, own: Phi) -> tuple[jax.Array, Any]:
         matrix, pull, active, alpha = natural(form, known, own)
-        both = active[:, None] & active[None, :]
-        covariance = jnp.where(both, linalg.inverse_and_logdet(matrix)[0], 0.0)
+        covariance = jnp.where(linalg.outer(active), linalg.inverse_and_logdet(matrix)[0], 0.0)
         variance = jnp.maximum(jnp.diagonal(covariance), 0.0)
         gamma = jnp.where(active, jnp.clip(1.0 - alpha * variance, 0.0, 1.0), 0.0)
         return total + covariance, (covariance @ pull, jnp.sqrt(variance), gamma)

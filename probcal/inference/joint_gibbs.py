@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -88,7 +88,7 @@ class GibbsChains(Chains):
         super().__post_init__()
         self.model, self.key, self.engine = self.problem.model, self.context.key, choose_fast(self.problem.model)
         self.form = Form(self.biases, hierarchy_of(self.prior, self.problem))
-        self.first = self.prior.precision(self.problem.labels, self.problem.surveyed)
+        self.first = self.problem.first_precision(self.prior)
         self.posed = Natural(jnp.zeros((0, 0)), jnp.zeros(0), self.model.level_spread, self.first)
         self.factors = Factors.alone(np.ones(self.biases)) if self.form.hierarchy.learnt else Factors.of(self.first)
         self.alone, self.coupled = levels_alone(self.model), Factors.coupled(self.first)
@@ -284,13 +284,13 @@ class Gibbs(Sampler):
     draws: int = 250
     patience: int = 4
 
-    name: ClassVar[str] = "Gibbs"
-    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
+    name = "Gibbs"
+    priors = (Horseshoe, Prior)
     work = GibbsChains
-    chunk: ClassVar[int] = 25
-    roomy: ClassVar[bool] = False
-    engined: ClassVar[bool] = True
-    refusal: ClassVar[str] = (
+    chunk = 25
+    roomy = False
+    engined = True
+    refusal = (
         "turns: the posterior is too far from the Gaussian of its linearised rows; take collapsed or nuts, of fewer"
         " sensors where these do not fit"
     )

@@ -6,16 +6,18 @@ import jax
 import jax.numpy as jnp
 
 from probcal.gaussian.frame import log_weight
+from probcal.gaussian.search import chosen
 from probcal.inference.gibbs import reversible_sweeps
 from probcal.inference.hierarchy import Phi
 from probcal.inference.posed import Form, Posed
+from probcal.model.trajectories import States
 
 
 class Place(NamedTuple):
     """Where a chain stands, in the frame's coordinates."""
 
     theta: jax.Array  # (Q,)
-    eps: tuple[jax.Array, ...]
+    eps: States
     phi: Phi
     weight: jax.Array  # log weight
 
@@ -34,7 +36,7 @@ def leap(form: Form, posed: Posed, at: Place, key: jax.Array, tries: int, sweeps
         tried = Place(theta, at.eps, phi, log_weight(posed.model, posed.frame, theta, at.eps))
         rate = jnp.exp(jnp.minimum(tried.weight - at.weight, 0.0))
         taken = jax.random.uniform(lot) < rate
-        return jax.tree.map(lambda new, old: jnp.where(taken, new, old), tried, at), jnp.nan_to_num(rate)
+        return chosen(taken, tried, at), jnp.nan_to_num(rate)
 
     at, rates = jax.lax.scan(one, at, jax.random.split(key, tries))
     return at, jnp.mean(rates)

@@ -138,8 +138,7 @@ class Method(ABC):
 
     def first_prior(self) -> Prior:
         """The prior where none is given."""
-        found: Prior = self.priors[0]()
-        return found
+        return self.priors[0]()
 
     def takes(self, prior: Prior) -> bool:
         """Whether the method can be used with a prior."""

@@ -70,13 +70,13 @@ def gaussian_at(
     problem: Problem, prior: Prior, at: Expansion, worth: Estimate, learnt: Precision | None = None
 ) -> Posterior:
     """The Gaussian at a mode on any engine, of log evidence `worth`, under precisions `learnt`."""
-    first = prior.precision(problem.labels, problem.surveyed) if learnt is None else learnt
+    first = problem.first_precision(prior) if learnt is None else learnt
     factors = Factors.of(first)
     spread = at.spread(factors)
     blocks = blocks_under(at, factors, spread)
     declared = blocks if prior.proper else blocks.under_scales()
     if prior.learns:
-        scales = Gaussian(correlation=prior.correlation).precision(problem.labels, problem.surveyed)
+        scales = problem.first_precision(Gaussian(correlation=prior.correlation))
         declared = blocks_under(at, Factors.of(scales))
     errors = {"sd_error": 0.5 * spread.error / spread.biases} if spread.error.any() else {}
     numbers = {"log_evidence_error": worth.error} if prior.proper and worth.error else {}

@@ -18,7 +18,7 @@ import numpy as np
 import numpyro
 from numpyro import distributions as dist
 
-from probcal.errors import InputError, nearest
+from probcal.errors import InputError, check_known
 from probcal.gaussian.frame import frame_at
 from probcal.gaussian.information import at_levels
 from probcal.gaussian.mode import Point, driven_states
@@ -146,7 +146,7 @@ def numpyro_model(problem: Problem, *, prior: AnyPrior = None) -> NumpyroModel:
             f" {', '.join(known)}, or fit it by Collapsed()"
         )
     check_linear(problem)
-    return NumpyroModel(problem, hierarchy, chosen.precision(problem.labels, problem.surveyed))
+    return NumpyroModel(problem, hierarchy, problem.first_precision(chosen))
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,8 +267,7 @@ def _given(data: Mapping[str, Any] | None, sites: list[str], own: tuple[Rows, ..
     """Values of every observed site: those given, and the problem's own."""
     found = {site: data_.y for site, data_ in zip(sites, own, strict=True)}
     for site, value in (data or {}).items():
-        if site not in found:
-            raise InputError(f'numpyro_model: no observed site is called "{site}"{nearest(site, sites)}')
+        check_known(site, sites, f'numpyro_model: no observed site is called "{site}"')
         if jnp.shape(value) != found[site].shape:
             raise InputError(
                 f'numpyro_model: data["{site}"] has shape {jnp.shape(value)}, its rows {found[site].shape}'

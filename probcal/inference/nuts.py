@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from probcal.errors import InputError
 from probcal.gaussian.frame import log_weight
 from probcal.inference.chains import Sample
-from probcal.inference.coordinates import Free, Parts, parts
+from probcal.inference.coordinates import Free, parts
 from probcal.inference.framed import FramedSampler
 from probcal.inference.hierarchy import Phi
 from probcal.inference.leaps import Place, leap
@@ -41,12 +41,12 @@ class NUTS(FramedSampler):
     depth: int = 10
     dense: bool = False
 
-    name: ClassVar[str] = "NUTS"
-    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
-    crosses: ClassVar[bool] = True
-    roams: ClassVar[bool] = True
-    chunk: ClassVar[int] = 20
-    roomy: ClassVar[bool] = False
+    name = "NUTS"
+    priors = (Horseshoe, Prior)
+    crosses = True
+    roams = True
+    chunk = 20
+    roomy = False
 
     def __post_init__(self):
         super().__post_init__()
@@ -84,7 +84,12 @@ class NUTS(FramedSampler):
         found = parts(form, posed, chain.z)
         jumps = dict[str, jax.Array]()
         if posed.orbits:
-            chain, found, jumps = self._jumped(form, posed, chain)
+            # the chain after a leap on the frame, and a proposal along each orbit
+            keys = jax.random.split(jax.random.fold_in(chain.rng_key, 1))
+            at, leapt = leap(form, posed, self.place(form, posed, chain), keys[0], 1, form.hierarchy.sweeps)
+            at, roamed = roam(form, posed, at, keys[1])
+            chain, jumps = self.put(form, posed, chain, at), {"leapt": leapt, "roamed": roamed}
+            found = parts(form, posed, chain.z)
         stats = {
             "acceptance_rate": chain.accept_prob,
             "diverging": chain.diverging,
@@ -94,14 +99,6 @@ class NUTS(FramedSampler):
             "step_size": chain.adapt_state.step_size,
         }
         return chain, Sample(found.theta, chain.z.eps, found.phi, found.joint, stats | jumps)
-
-    def _jumped(self, form: Form, posed: Posed, chain: Any) -> tuple[Any, Parts, dict[str, jax.Array]]:
-        """The chain after a leap on the frame, and a proposal along each orbit."""
-        keys = jax.random.split(jax.random.fold_in(chain.rng_key, 1))
-        at, leapt = leap(form, posed, self.place(form, posed, chain), keys[0], 1, form.hierarchy.sweeps)
-        at, roamed = roam(form, posed, at, keys[1])
-        chain = self.put(form, posed, chain, at)
-        return chain, parts(form, posed, chain.z), {"leapt": leapt, "roamed": roamed}
 
     def place(self, form: Form, posed: Posed, chain: Any) -> Place:
         """Where a chain stands."""

@@ -18,11 +18,14 @@ import numpy as np
 from probcal import linalg
 from probcal.gaussian.frame import log_weight, place, unit_normals, volume
 from probcal.gaussian.mode import Point, driven_states
+from probcal.gaussian.search import chosen
+from probcal.inference.draws import accepted
 from probcal.inference.leaps import Place
 from probcal.inference.posed import Form, Posed, log_prior
 from probcal.linalg import least_squares
 from probcal.model.model import Recursion
-from probcal.model.trajectories import Trajectories
+from probcal.model.rows import level_factors
+from probcal.model.trajectories import States, Trajectories
 from probcal.modes.reflections import place_biases
 from probcal.problem import Problem
 
@@ -50,7 +53,7 @@ class Orbit:
     base: jax.Array  # (nodes, d) stated places
     scale: jax.Array  # (M,)
     centre: jax.Array  # (d,)
-    pinned: tuple[jax.Array, ...]  # pseudo-inverses (E, n, n) of the noise factors of each recursion
+    pinned: States  # pseudo-inverses (E, n, n) of the noise factors of each recursion
     size: jax.Array  # () sd of r by the frame
 
     def vector(self, r: jax.Array, value: jax.Array, *, place: bool) -> jax.Array:
@@ -77,7 +80,7 @@ class Orbit:
             z = z.at[index].add(r / self.scale[index])
         return z
 
-    def states(self, r: jax.Array, states: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    def states(self, r: jax.Array, states: States) -> States:
         """Trajectories (E, n) moved by r."""
         found = []
         for x, spans in zip(states, self.spans, strict=True):
@@ -91,12 +94,8 @@ class Orbit:
         levels = point.levels.at[jnp.asarray(self.levels, int)].add(r) if self.levels else point.levels
 
         def moved(x: jax.Array, u: jax.Array, part: Recursion, inverse: jax.Array) -> tuple[jax.Array, jax.Array]:
-            old, new = (
-                jnp.concatenate([jnp.exp(own), jnp.ones(1)])[part.level] / jnp.sqrt(part.weight)
-                for own in (point.levels, levels)
-            )
-            before = jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]])
-            source = x - part.drift - jnp.einsum("eij,ej->ei", part.F, before)
+            old, new = (level_factors(own)[part.level] / jnp.sqrt(part.weight) for own in (point.levels, levels))
+            source = x - part.drift - jnp.einsum("eij,ej->ei", part.F, linalg.preceding(x))
             idle = jnp.einsum("eij,ej->ei", part.L, old * u)  # columns that reach no state stay as they are
             return x, (old * u + jnp.einsum("eij,ej->ei", inverse, source - idle)) / new
 
@@ -129,9 +128,8 @@ def roam(form: Form, posed: Posed, at: Place, key: jax.Array) -> tuple[Place, ja
         if orbit.levels:  # the frame spreads eps otherwise at other levels
             there, here = (volume(posed.model, posed.frame, one.theta) for one in (tried, at))
             gain = gain - there + here
-        accepted = jnp.log(jax.random.uniform(lot)) < jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
-        at = jax.tree.map(lambda new, old, accepted=accepted: jnp.where(accepted, new, old), tried, at)
-        taken = taken + accepted
+        moves = accepted(lot, gain)
+        at, taken = chosen(moves, tried, at), taken + moves
     return at, taken / max(len(posed.orbits), 1)
 
 
@@ -143,12 +141,12 @@ def orbits_of(problem: Problem, posed: Posed, covariance: np.ndarray) -> tuple[O
     whole = {name: own for name, own in place_biases(problem).items() if len(own) == d}
     if not whole or any(form is not None for form in problem.model.sampled):
         return ()
-    base: Any = np.stack([by_name[name].position for name in whole])
+    base = np.stack([by_name[name].position for name in whole])
     spans = tuple(
         tuple((a, b, name == "position") for name, a, b, axis in epochs.layout if name in VECTORS and axis)
         for epochs in problem.epochs
     )
-    pinned: Any = tuple(linalg.pseudo_inverse(np.asarray(part.L)) for part in problem.model.recursions)
+    pinned = tuple(linalg.pseudo_inverse(np.asarray(part.L)) for part in problem.model.recursions)
     places = tuple(tuple(own) for own in whole.values())
     driven, found = _levels(problem, spans), list[Orbit]()
     kinds = [("turn", pair, ()) for pair in combinations(range(d), 2)] + [("shift", (a, a), ()) for a in range(d)]
@@ -183,8 +181,8 @@ def _entries_of(problem: Problem, spans: tuple[Any, ...]) -> tuple[np.ndarray, .
 
 def _levels(problem: Problem, spans: tuple[Any, ...]) -> tuple[int, ...]:
     """Unknown levels of the process noise of places, which belong to nothing else."""
-    found: set[int] = set()
-    other: set[int] = set()
+    found = set()
+    other = set()
     H = len(problem.levels)
     for part, mine in problem.model.each_layout(_entries_of(problem, spans)):
         L, level = np.asarray(part.L) != 0, np.asarray(part.level)

@@ -81,8 +81,8 @@ def pilot(form: Form, posed: Posed, key: jax.Array) -> Pilot:
     return Pilot(*jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found))
 
 
-@partial(jax.jit, static_argnames="form")
-def weights(form: Form, posed: Posed, theta: jax.Array, key: jax.Array) -> jax.Array:
+@jax.jit
+def weights(posed: Posed, theta: jax.Array, key: jax.Array) -> jax.Array:
     """Log weights (D,) of draws theta (D, Q) with trajectories drawn from the frame."""
 
     def one(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
@@ -143,12 +143,12 @@ def pose(
     """
     model = problem.model
     form = Form(model.biases, hierarchy_of(prior, problem))
-    posed = Posed(model, frame_at(model, start), prior.precision(problem.labels, problem.surveyed))
-    best: tuple[Posed, Pilot, Worth] | None = None
+    posed = Posed(model, frame_at(model, start), problem.first_precision(prior))
+    best = None
     for move in range(MOVES + 1):
         keys = jax.random.split(jax.random.fold_in(key, move), 3)
         found = pilot(form, posed, keys[0])
-        logs = np.asarray(weights(form, posed, found.theta, keys[1]))
+        logs = np.asarray(weights(posed, found.theta, keys[1]))
         held = np.asarray(weights_along(posed, found.theta[::ROUNDS], keys[1]))
         worth = Worth(pareto_khat(logs), float(np.mean([acceptance(own) for own in held])), acceptance(logs), move)
         if best is None or worth.order(whole=whole) > best[2].order(whole=whole):

@@ -1,10 +1,10 @@
-"""A posterior posed for sampling: problem, frame and prior hierarchy, with the Gaussian conditionals they give.
+"""A posterior prepared for sampling: problem, frame and prior hierarchy, with the Gaussian conditionals they give.
 
 theta holds the biases z (M,) and the log levels (H,). Given the hyper-parameters phi the frame makes theta Gaussian.
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,26 +29,6 @@ class Form:
         """The prior of the biases that no hierarchy governs, flat for all others."""
         governed = np.isin(np.arange(self.biases), self.hierarchy.learnt)
         return first._replace(alpha=jnp.where(governed, 0.0, first.alpha))
-
-
-class Quadratic(Protocol):
-    """A Gaussian likelihood of theta in natural form, and the prior of the biases that no hierarchy governs."""
-
-    @property
-    def information(self) -> jax.Array:
-        """Precision (Q, Q)."""
-
-    @property
-    def pull(self) -> jax.Array:
-        """Linear term about zero, (Q,)."""
-
-    @property
-    def level_spread(self) -> jax.Array:
-        """Prior sd (H,) of the log levels that theta holds."""
-
-    @property
-    def first(self) -> Precision:
-        """Prior of the biases before a hierarchy governs some."""
 
 
 class Natural(NamedTuple):
@@ -83,6 +63,10 @@ class Posed(NamedTuple):
     def level_spread(self) -> jax.Array:
         """Prior sd (H,) of the log levels."""
         return self.model.level_spread
+
+
+# a Gaussian likelihood of theta in natural form, and the prior of the biases that no hierarchy governs
+Quadratic = Natural | Posed
 
 
 class Conditional(NamedTuple):
@@ -127,7 +111,7 @@ def natural(form: Form, posed: Quadratic, phi: Phi) -> tuple[jax.Array, jax.Arra
     alpha, coupling = prior_precision(form, posed, phi)
     active = activity(form, posed, phi)
     matrix = posed.information + coupling + jnp.diag(alpha)
-    matrix = jnp.where(active[:, None] & active[None, :], matrix, jnp.eye(alpha.shape[0]))
+    matrix = jnp.where(linalg.outer(active), matrix, jnp.eye(alpha.shape[0]))
     return matrix, jnp.where(active, posed.pull, 0.0), active, alpha
 
 
@@ -163,8 +147,7 @@ def update_inclusions(form: Form, posed: Quadratic, phi: Phi, key: jax.Array, *,
     alpha, coupling = prior_precision(form, posed, phi)
     matrix, pull = posed.information + coupling + jnp.diag(alpha), posed.pull
     start = conditional(form, posed, phi)
-    both = start.active[:, None] & start.active[None, :]
-    covariance = jnp.where(both, start.inverse.T @ start.inverse, 0.0)
+    covariance = jnp.where(linalg.outer(start.active), start.inverse.T @ start.inverse, 0.0)
     share = kind.share(phi)
     odds = jnp.broadcast_to(jnp.log(share) - jnp.log1p(-share), (L,))
 

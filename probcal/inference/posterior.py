@@ -125,7 +125,7 @@ def draw_run(own: Posterior, key: jax.Array, keep: tuple[str, ...]) -> Draws:
 
 def _numbers(run: SamplerRun) -> dict[str, float]:
     """Seconds, the worth of the frame, and the limits used."""
-    found: dict[str, Any] = {"seconds": run.seconds, "rope": ROPE, "thin": run.thin}
+    found = {"seconds": run.seconds, "rope": ROPE, "thin": run.thin}
     if run.worth is not None:
         found |= {"frame_khat": run.worth.khat, "frame_moves": run.worth.moves}
         found |= {"frame_acceptance": run.worth.acceptance}
@@ -145,19 +145,8 @@ def conclude_draws(
     known = facts_of(problem, run, mixed) | ({} if unexplained else facts_of_steps(problem, prior, run))
     status, message = judge(CHAINS, known | facts | {"misfit": unexplained})
     ended = bias_status(problem, {"not mixed": mixed["r_hat"][: run.form.biases] > 1.05} if "r_hat" in mixed else {})
-    return Answer(
-        problem, run.method, run.asked, prior, posterior, status, message, ended, run.z.shape[1],
-        interrupted=bool(run.stopped), mirrors=_mirrors(run, str(status)),
-    )  # fmt: skip
-
-
-def heaviest(run: SamplerRun) -> int:
-    """The side of a mirror that most draws are on."""
-    return int(np.bincount(run.side.ravel()).argmax())
-
-
-def _mirrors(run: SamplerRun, status: str) -> tuple[Mirrored, ...]:
-    """The other sides that draws are on, seen from the heaviest: log ratio of weights, and shift of the means."""
+    # the other sides that draws are on, seen from the heaviest: log ratio of weights, and shift
+    # of the means
     first, share = heaviest(run), np.bincount(run.side.ravel(), minlength=len(run.sides) + 1) / run.side.size
     middle = run.z[run.side == first].mean(0)
     found = []
@@ -167,8 +156,16 @@ def _mirrors(run: SamplerRun, status: str) -> tuple[Mirrored, ...]:
             shift = run.z[run.side == k].mean(0) - middle
             point = other.point if k else _framed(run)
             gain = float(np.log(share[k] / share[first]))
-            found.append(Mirrored(other.name, gain, point, shift, status=status))
-    return tuple(found)
+            found.append(Mirrored(other.name, gain, point, shift, status=str(status)))
+    return Answer(
+        problem, run.method, run.asked, prior, posterior, status, message, ended, run.z.shape[1],
+        interrupted=bool(run.stopped), mirrors=tuple(found),
+    )  # fmt: skip
+
+
+def heaviest(run: SamplerRun) -> int:
+    """The side of a mirror that most draws are on."""
+    return int(np.bincount(run.side.ravel()).argmax())
 
 
 def _framed(run: SamplerRun) -> Point:
@@ -229,7 +226,7 @@ def _stats(run: SamplerRun) -> dict[str, np.ndarray]:
 def facts_of(problem: Problem, run: SamplerRun, mixed: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """The facts that a run says of its draws, in the names of `probcal.status.CHAINS`."""
     draws, names = run.z.shape[1], [*problem.labels, *(level.label for level in problem.levels)]
-    facts: dict[str, Any] = {"note": run.note} | mixed_of(names, mixed, run.z.shape[0])
+    facts = {"note": run.note} | mixed_of(names, mixed, run.z.shape[0])
     if run.stopped:
         how = f"after {draws} of {run.method.draws} draws a chain"
         again = "while more steps were made, as the draws had not mixed"

@@ -72,13 +72,7 @@ class BiasLikelihood:
     engine: Engine
     here: Expansion
     prior: Factors  # of the biases that no hierarchy governs
-    whole: bool  # whether the covariance of all biases is made
     marginal: bool = True  # whether the determinant of the trajectories belongs to it; not at a joint mode
-
-    @classmethod
-    def of(cls, engine: Engine, at: Expansion, prior: Factors, *, marginal: bool = True) -> BiasLikelihood:
-        """The likelihood at an expansion by an engine, and the prior of the biases that no hierarchy governs."""
-        return cls(engine, at, prior, engine.cheap, marginal)
 
     @property
     def z(self) -> np.ndarray:
@@ -134,8 +128,8 @@ def sweep_blocks(
 
     def given(alpha: jax.Array, active: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Root (B, p, p) of the covariances of the blocks and its product with the pull, of what is active (B, p)."""
-        both = active[:, :, None] & active[:, None, :]
-        root = jax.vmap(linalg.inverse_cholesky)(jnp.where(both, cavity.precision + eye * alpha[:, :, None], eye))
+        precision = cavity.precision + eye * alpha[:, :, None]
+        root = jax.vmap(linalg.inverse_cholesky)(jnp.where(linalg.outer(active), precision, eye))
         return root, jnp.einsum("bij,bj->bi", root, jnp.where(active, cavity.pull, 0.0))
 
     def include(phi: Phi, key: jax.Array) -> Phi:
@@ -171,9 +165,8 @@ def sweep_blocks(
             phi = include(phi, keys[-2])
         alpha, active = kind.alpha(phi, first.alpha), of_members(kind.active(phi, M), True)
         root, half = given(of_members(kind.alpha(phi, jnp.zeros(M)), 0.0), active)
-        both = active[:, :, None] & active[:, None, :]
         middle = jnp.where(active, jnp.einsum("bji,bj->bi", root, half), 0.0)
-        covariance = jnp.where(both, root.mT @ root, 0.0)
+        covariance = jnp.where(linalg.outer(active), root.mT @ root, 0.0)
         noise = jnp.einsum("bji,bj->bi", root, jax.random.normal(keys[-1], half.shape))
         variance = of_biases(jnp.diagonal(covariance, axis1=1, axis2=2))
         on = (k >= BURN) * 1.0
@@ -181,7 +174,7 @@ def sweep_blocks(
         inside = of_biases(active) & (variance > 0)
         sums = (
             count + on, mean + on * middle,
-            second + on * (covariance + middle[:, :, None] * middle[:, None, :]),
+            second + on * (covariance + linalg.outer(middle)),
             gamma + on * jnp.where(inside, jnp.clip(1.0 - alpha * variance, 0.0, 1.0), 0.0),
             means.at[slot].set(of_biases(middle)), sds.at[slot].set(jnp.sqrt(variance)),
         )  # fmt: skip
@@ -193,8 +186,8 @@ def sweep_blocks(
     (chain, sums), _ = jax.lax.scan(one, (chain, blank), jnp.arange(BURN + EVERY * KEPT))
     count, mean, second, gamma, means, sds = sums
     mean = mean / count
-    covariance = second / count - mean[:, :, None] * mean[:, None, :]
-    return chain, BlocksSwept(mean, covariance + SPIKE * eye, gamma / count, means, sds)
+    covariance = second / count - linalg.outer(mean) + SPIKE * eye
+    return chain, BlocksSwept(mean, covariance, gamma / count, means, sds)
 
 
 class PropagationState(NamedTuple):
@@ -291,7 +284,7 @@ class Propagation(Task):
         floor = -MINUS * cavity.precision  # what is left of a cavity stays positive
         there = np.isin(self.members, self.form.hierarchy.learnt)  # a site is of the biases that it governs alone
         positive = without_negative(new.precision - floor, LEAST) + floor
-        precision = np.where(there[:, :, None] & there[:, None, :], positive, 0.0)
+        precision = np.where(linalg.outer(there), positive, 0.0)
         new = Blocks(precision, np.where(there, new.pull, 0.0))
         share = min(DAMPING, 1.0 / max(turn - SURE, 1))  # later rounds are averaged: sweeps are noisy
         self.sites = Blocks(*(share * a + (1 - share) * b for a, b in zip(new, self.sites, strict=True)))

@@ -32,7 +32,7 @@ from probcal.inference.method import Context, Given, Iterated, MethodTask, State
 from probcal.inference.placed import Reached, with_places
 from probcal.linalg import library
 from probcal.model.model import Model
-from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Gaussian, Precision, Prior
+from probcal.priors import ARD, PRECISION_BOUNDS, Flat, Gaussian, Prior
 from probcal.priors import Laplace as LaplacePrior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
@@ -80,7 +80,7 @@ class KernelClimb(MethodTask):
             return state, jax.tree.map(lambda leaf: np.asarray(leaf)[~np.asarray(idle)], course)
         state = stepped(self.method, *fixed, state)
         state = self.method.close(self.model.with_mixing(state.mixing), self.bare, self.given, state)
-        return state, jax.tree.map(lambda leaf: np.asarray(leaf)[None], course_of(state))
+        return state, single_course(state)
 
     def ended(self, state: State, trace: Trace) -> bool:
         """True where the method is done, or long iterations gain nothing any more."""
@@ -102,9 +102,7 @@ class KernelClimb(MethodTask):
         how, mixed = method.integration(problem, prior), None
         problem = problem.with_mixing(state.mixing)
         if how is not None:
-            mixed = integrate(
-                how, problem.model, first_precision(problem, prior), state.point, context.key, search=True
-            )
+            mixed = integrate(how, problem.model, problem.first_precision(prior), state.point, context.key, search=True)
         return conclude(problem, method, prior, state, course, how, mixed, context.monitor.stopped)
 
     def _with_places(self, state: State, trace: Trace) -> tuple[Problem, State, Trace]:
@@ -221,7 +219,7 @@ def kernel(method: Any) -> Any:
 
 def bare(prior: Prior) -> Prior:
     """The prior without what reaches kernels as arrays (correlations, kinds, groups): these are compiled once."""
-    alone: dict[str, Any] = {"correlation": (), "kinds": ()} | ({"by": None} if isinstance(prior, ARD) else {})
+    alone = {"correlation": (), "kinds": ()} | ({"by": None} if isinstance(prior, ARD) else {})
     return replace(prior, **alone)
 
 
@@ -233,16 +231,11 @@ def check_method(method: Maximiser) -> None:
         raise InputError(f"{method.name}(tolerance={method.tolerance}): give a finite number that is not negative")
 
 
-def first_precision(problem: Problem, prior: Prior) -> Precision:
-    """Precisions of the biases before any is learnt, and the couplings of correlated ones."""
-    return prior.precision(problem.labels, problem.surveyed)
-
-
 def given_of(method: Maximiser, problem: Problem, prior: Prior) -> Given:
     """Arrays of a prior and of the stopping rule for a problem."""
     prior = method.climbs_under(prior)
     numbers: Any = held(prior, problem), learnt_groups(prior, problem), np.array(float(method.tolerance))
-    return Given(first_precision(problem, prior), *numbers)
+    return Given(problem.first_precision(prior), *numbers)
 
 
 def first_state(given: Given, model: Model, start: Point, carry: Any, seed: jax.Array, whole: bool = True) -> State:
@@ -295,6 +288,11 @@ def chunk(
     return method.close(model.with_mixing(state.mixing), prior, given, state), trace
 
 
+def single_course(state: State) -> Trace:
+    """The course of one iteration, by its state."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[None], course_of(state))
+
+
 def course_of(state: State) -> Trace:
     """The course of a climb as far as one state tells it."""
     return Trace(state.objective, state.point.z, state.alpha)
@@ -302,6 +300,6 @@ def course_of(state: State) -> Trace:
 
 def stepped(method: Any, model: Model, prior: Prior, given: Given, state: State) -> State:
     """One outer iteration at the precisions of the process noise that a state has; two without an objective end it."""
-    after: State = method.iterate(model.with_mixing(state.mixing), prior, given, state)
+    after = method.iterate(model.with_mixing(state.mixing), prior, given, state)
     lib = library(after.objective)
     return after._replace(done=lib.logical_or(after.done, lib.isnan(after.objective) & lib.isnan(state.objective)))

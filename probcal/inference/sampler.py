@@ -40,8 +40,8 @@ class Sampler(Method, ABC):
     crosses: ClassVar[bool] = False  # whether its chains visit other sides of a mirror, by `across`
     roams: ClassVar[bool] = False  # whether its chains move along orbits where the frame fits badly, by `roam`
     refusal: ClassVar[str] = ""  # its steps, and what is wrong where a chain takes few of them; empty: not looked at
-    intervals: ClassVar[str] = "quantiles of the exact posterior"
-    climbs: ClassVar[bool] = False
+    intervals = "quantiles of the exact posterior"
+    climbs = False
 
     def __post_init__(self):
         for field, least in (("chains", 1), ("warmup", 0), ("draws", 1)):

@@ -115,7 +115,7 @@ class Chains(MethodTask):
     `init` says what they move on: `form`, `posed`, and where there is a frame its `worth`.
     """
 
-    kind: ClassVar[str] = "draws"
+    kind = "draws"
     iterations: ClassVar[int] = DRAWS  # more chunks than any plan has: `ended` knows the last
 
     sides: tuple[Mirrored, ...] = ()  # other sides of a mirror that they visit
@@ -145,8 +145,13 @@ class Chains(MethodTask):
         plan = self.plan(count)
         self._enter(plan.phase(count))
         state, draws = self.advance(state, plan.thin)
-        kept, arrays = plan.kept(count), flat_arrays(draws)
-        last = {name: a[:, a.shape[1] - kept :].copy() for name, a in arrays.items()}
+        # draws as arrays (chains, draws, ...) by flat names, as a storage keeps them
+        found = {name: getattr(draws, name) for name in ("theta", "gamma", "variance", "density")}
+        found |= {f"phi_{name}": value for name, value in draws.phi.items()}
+        found |= {f"stats_{name}": value for name, value in draws.stats.items()}
+        found |= {f"states_{r}": value for r, value in enumerate(draws.states)}
+        kept, arrays = plan.kept(count), {name: np.asarray(value) for name, value in found.items()}
+        last: dict[str, Any] = {name: a[:, a.shape[1] - kept :].copy() for name, a in arrays.items()}
         return state, DrawnChunks([last | {MEAN: np.mean(arrays["density"])}])
 
     def ended(self, state: Any, course: DrawnChunks) -> bool:
@@ -209,15 +214,6 @@ def each_chain(one: Callable[[Any], tuple[Any, Draw]], states: Any, chains: int,
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
         found = list(pool.map(alone, range(chains)))
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
-
-
-def flat_arrays(draws: Draw) -> dict[str, np.ndarray]:
-    """Draws as arrays (chains, draws, ...) by flat names, as a storage keeps them."""
-    found: dict[str, Any] = {name: getattr(draws, name) for name in ("theta", "gamma", "variance", "density")}
-    found |= {f"phi_{name}": value for name, value in draws.phi.items()}
-    found |= {f"stats_{name}": value for name, value in draws.stats.items()}
-    found |= {f"states_{r}": value for r, value in enumerate(draws.states)}
-    return {name: np.asarray(value) for name, value in found.items()}
 
 
 def gathered(arrays: Mapping[str, np.ndarray]) -> Draw:

@@ -87,8 +87,7 @@ def solve_timed(
     monitor = context.monitor
     monitor.enter("start", method.name)
     if method.by_particles:
-        found: Answer = of_wing("solve_by_particles")(problem, method, prior, context, start, starts)
-        return found
+        return of_wing("solve_by_particles")(problem, method, prior, context, start, starts)
     given, problem = problem, method.prepare(problem)
     engined = _on_engine(problem, method, prior, starts)
     method, large = engined or method, engined is not None

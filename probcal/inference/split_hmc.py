@@ -20,7 +20,7 @@ from probcal.gaussian.engine import Expansion, Factors
 from probcal.gaussian.jointly import Variables, covariance_times, times_weights
 from probcal.gaussian.mode import Point, mixed_density, noises_of
 from probcal.model.model import At, Model, Recursion
-from probcal.model.rows import Linearised
+from probcal.model.rows import LinearRows
 from probcal.simulate import chance_of
 
 SHORTER = 0.1  # share by which a turn may be shorter than a quarter
@@ -136,9 +136,7 @@ class SplitGaussian:
 
 
 @jax.jit
-def _rest(
-    model: Model, point: Point, rows: tuple[Linearised, ...], variables: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def _rest(model: Model, point: Point, rows: LinearRows, variables: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Log-likelihood less what is linear and quadratic about a point, and its slope (n,).
 
     Process noise, prior and integrated places are quadratic and leave no rest.
@@ -174,7 +172,7 @@ def _log_density(model: Model, point: Point, variables: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def _own_precisions(model: Model, rows: tuple[Linearised, ...]) -> jax.Array:
+def _own_precisions(model: Model, rows: LinearRows) -> jax.Array:
     """Diagonal (M,) of the information of the rows about the biases at held states."""
     found = jnp.zeros(model.biases + 1)
     for _, data, _, lin in model.each_block(rows):
@@ -188,7 +186,7 @@ def _own_precisions(model: Model, rows: tuple[Linearised, ...]) -> jax.Array:
 
 
 @jax.jit
-def _precision_times(model: Model, rows: tuple[Linearised, ...], variables: jax.Array) -> jax.Array:
+def _precision_times(model: Model, rows: LinearRows, variables: jax.Array) -> jax.Array:
     """The rows (M,) of the biases of the joint precision, without prior, times variables (n,)."""
     states, z = split_variables(model, variables)
     along = model.responses(rows, [x[:, :, None] for x in states], z[:, None])

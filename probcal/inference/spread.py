@@ -140,7 +140,7 @@ def _client(scheduler: Any, batches: int) -> Iterator[Any]:
     with ExitStack() as stack:
         if scheduler == LOCAL:
             stack.enter_context(_same_environment())
-            at: Any = stack.enter_context(_local_cluster(batches))
+            at = stack.enter_context(_local_cluster(batches))
         else:
             at = scheduler
             _check_answer(scheduler)

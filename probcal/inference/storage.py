@@ -98,17 +98,14 @@ class Storage:
         if there and files and not overwrite:
             if not resume:
                 raise InputError(f"{path} holds {described(path)} already; {REMEDY}")
-            self._take_up(path)
+            kind, other = read_manifest(path)
+            if kind != self.kind:
+                raise InputError(f"{path} holds a run of another kind ({kind}); give another folder, or {OVERWRITE}")
+            check_same(path, self.identity, other)
+            self._numbers = set(parts_of(path))
             return
         clear_parts(path)
         write_manifest(path, self.kind, self.identity)
-
-    def _take_up(self, path: Path) -> None:
-        kind, other = read_manifest(path)
-        if kind != self.kind:
-            raise InputError(f"{path} holds a run of another kind ({kind}); give another folder, or {OVERWRITE}")
-        check_same(path, self.identity, other)
-        self._numbers = set(parts_of(path))
 
     @property
     def numbers(self) -> list[int]:
@@ -149,7 +146,7 @@ class Storage:
         """Keep a part: its arrays by name."""
         if self.path is not None:
             content = io.BytesIO()
-            marked: dict[str, Any] = {**arrays, "probcal": np.array(self._mark(number))}
+            marked = {**arrays, "probcal": np.array(self._mark(number))}
             np.savez(content, **marked)
             write_whole(self._file(number), content.getbuffer())
         self._numbers.add(number)

@@ -6,7 +6,7 @@ Duvenaud 2017, "Sticking the landing"); steps by Adam (Kingma, Ba 2015) that shr
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from probcal.errors import InputError
+from probcal.gaussian.search import chosen
 from probcal.inference.chains import Sample
 from probcal.inference.coordinates import Free, parts
 from probcal.inference.framed import FramedSampler
@@ -56,14 +57,12 @@ class SVI(FramedSampler):
     rate: float = 0.05
     particles: int = 4
 
-    name: ClassVar[str] = "SVI"
-    priors: ClassVar[tuple[type, ...]] = (Horseshoe, Prior)
-    chunk: ClassVar[int] = 50
-    roomy: ClassVar[bool] = False
-    exact: ClassVar[bool] = False
-    intervals: ClassVar[str] = (
-        "quantiles of a variational approximation: too narrow where the guide does not fit, see k-hat"
-    )
+    name = "SVI"
+    priors = (Horseshoe, Prior)
+    chunk = 50
+    roomy = False
+    exact = False
+    intervals = "quantiles of a variational approximation: too narrow where the guide does not fit, see k-hat"
 
     def __post_init__(self):
         super().__post_init__()
@@ -130,7 +129,7 @@ class SVI(FramedSampler):
         )  # fmt: skip
         mean = jnp.where(jnp.isfinite(chain.bound), SMOOTH * chain.bound + (1 - SMOOTH) * value, value)
         found = chain._replace(fitted=fitted, slope=slope, square=square, bound=mean)
-        found = jax.tree.map(lambda new, old: jnp.where(sound, new, old), found, chain)
+        found = chosen(sound, found, chain)
         return found._replace(trace=found.trace.at[chain.steps].set(found.bound))
 
     def guide(self, form: Form, posed: Posed) -> Guide:

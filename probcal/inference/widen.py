@@ -27,7 +27,7 @@ from probcal.motion.base import level_name
 from probcal.priors import Precision
 from probcal.problem import Problem
 from probcal.results.blocks import SensorBlocks
-from probcal.results.groups import along, by_target, datum_of
+from probcal.results.groups import along, by_target, data_columns, datum_of
 from probcal.results.read import Calibrated
 from probcal.status import INVALID
 from probcal.types import float64
@@ -158,32 +158,6 @@ def before_data(model: Model, levels: jax.Array) -> list[jax.Array]:
     return [jnp.diagonal(recur_squared(F, L @ L.mT), axis1=1, axis2=2) for F, L in roots]
 
 
-def _noises(fit: Judged, rejected: Rejection, rng: np.random.Generator) -> tuple[Data, Data]:
-    """Unit noise (N, C, K) of each block as the model has it, and with the size and memory that
-    each channel shows."""
-    white = rng.standard_normal((len(fit.data), COLUMNS))
-    red = np.empty_like(white)
-    target, time = fit.data["target"].to_numpy(str), fit.data["time"].to_numpy()
-    for mine, size, memory in zip(rejected.channels.members, *rejected.scatter, strict=True):
-        order = mine[np.lexsort((time[mine], target[mine]))]
-        again = (memory - 1.0) / (memory + 1.0)  # autoregressive noise of which so many count as one
-        fresh = np.sqrt(1.0 - again**2) * white[order]
-        fresh[0] = white[order[0]]
-        red[order] = np.sqrt(size) * signal.lfilter([1.0], [1.0, -again], fresh, axis=0)
-    return in_blocks(fit, white), in_blocks(fit, red)
-
-
-def in_blocks(fit: Judged, values: np.ndarray) -> Data:
-    """Values by datum (D, K) as those of the blocks (N, C, K), zero where nothing is measured."""
-    found, start = [], 0
-    for there, pick in zip(fit.problem.model.measured, fit.picks, strict=True):
-        block = np.zeros((*there.shape, values.shape[1]))
-        block[pick] = values[start : start + len(pick[0])]
-        start += len(pick[0])
-        found.append(jax.device_put(block))
-    return tuple(found)
-
-
 def track_factors(
     fit: Judged, rejected: Rejection, tracks: xr.DataTree, root: Any, wide: np.ndarray
 ) -> dict[str, np.ndarray]:
@@ -199,7 +173,17 @@ def track_factors(
     more = [np.zeros(part.drift.shape) for part in model.recursions]
     for _ in range(chunks):
         biases = root @ rng.standard_normal((root.shape[1], COLUMNS))
-        plain, shown = _noises(fit, rejected, rng)
+        # unit noise (N, C, K) of each block as the model has it, and with the size and memory that each channel shows
+        white = rng.standard_normal((len(fit.data), COLUMNS))
+        red = np.empty_like(white)
+        target, time = fit.data["target"].to_numpy(str), fit.data["time"].to_numpy()
+        for mine, size, memory in zip(rejected.channels.members, *rejected.scatter, strict=True):
+            order = mine[np.lexsort((time[mine], target[mine]))]
+            again = (memory - 1.0) / (memory + 1.0)  # autoregressive noise of which so many count as one
+            fresh = np.sqrt(1.0 - again**2) * white[order]
+            fresh[0] = white[order[0]]
+            red[order] = np.sqrt(size) * signal.lfilter([1.0], [1.0, -again], fresh, axis=0)
+        plain, shown = fit.in_blocks(white), fit.in_blocks(red)
         for sign, noise, moved in ((-1, plain, biases), (1, shown, wide[:, None] * biases)):
             errors = _errors(model, fit.lins, fit.expansion.eliminated, noise, jax.device_put(moved))
             more = [own + sign * np.asarray(error) / chunks for own, error in zip(more, errors, strict=True)]
@@ -279,8 +263,7 @@ def widening_factors(
     """Factors (M,) of sds, of whose variance the share gamma grows by `inflation`; never beyond the sds before data."""
     share = np.clip(1.0 - (sd / before) ** 2, 0.0, 1.0) if gamma is None else gamma
     wide = np.sqrt(1.0 + share * (inflation - 1.0))
-    found: np.ndarray = np.clip(wide, 1.0, np.maximum(before / sd, 1.0))
-    return found
+    return np.clip(wide, 1.0, np.maximum(before / sd, 1.0))
 
 
 def _widen_biases(result: xr.DataTree, group: xr.Dataset, wide: np.ndarray) -> None:
@@ -360,7 +343,7 @@ def judge_tracks(tree: xr.DataTree, problem: Problem, known: Calibrated, engine:
     scatter.
     """
     datum, picks = datum_of(problem)
-    data = pd.DataFrame({name: values for name, (_, values) in datum["coords"].items()})
+    data = pd.DataFrame(data_columns(datum))
     flat, root, spread, dz = Precision(jnp.zeros(len(known.z))), known.spread.root(), known.spread, None
     if spread.whole and (information := at.information()) is not None:
         values, vectors = spectrum(root.T @ information @ root)

@@ -16,9 +16,9 @@ import numpy as np
 from probcal import linalg
 from probcal.errors import InputError
 from probcal.model import rows as waist
-from probcal.model.rows import Block, Linearised, Rows
+from probcal.model.rows import Block, LinearRows, Rows
 from probcal.model.sampled import SampledMotion, check_densities
-from probcal.model.trajectories import Loops
+from probcal.model.trajectories import Loops, States
 
 State = tuple[Any, ...]  # (T, n) of each recursion, or a pytree with T leading
 
@@ -55,7 +55,7 @@ class Epoch(NamedTuple):
     dt: jax.Array  # () since the epoch before of the same target, 0 at its first
     first: jax.Array  # () whether the target begins here: `step` then ignores x
     recursion: jax.Array  # () the recursion of the target
-    target: tuple[jax.Array, ...]  # () of each recursion which target moves; in the others a move that changes nothing
+    target: States  # () of each recursion which target moves; in the others a move that changes nothing
     move: tuple[Move, ...]  # of each recursion
     rows: tuple[Seen, ...]  # of each block
 
@@ -182,7 +182,7 @@ class Stepwise(Loops):
 
     def linearise_at(
         self, epoch: Epoch, x: State, z: jax.Array, levels: jax.Array, *, expected: bool = True
-    ) -> tuple[Linearised, ...]:
+    ) -> LinearRows:
         """The rows of an epoch linearised, Jacobians by the state of its target whole: (P, C, n) for each block.
 
         Raises `InputError` where a motion has no linear form.
@@ -231,7 +231,7 @@ class Stepwise(Loops):
         form = self.sampled[r]
         return states if form is None else jax.vmap(form.vector)(states)
 
-    def vectors_of(self, states: tuple[Any, ...]) -> tuple[jax.Array, ...]:
+    def vectors_of(self, states: tuple[Any, ...]) -> States:
         """What rows read of the states of each recursion, (E, n)."""
         return tuple(map(self.vectors, range(len(states)), states))
 
@@ -250,12 +250,7 @@ def _mean(states: jax.Array, move: Move, target: jax.Array) -> jax.Array:
 
 
 def _root(move: Move, levels: jax.Array) -> jax.Array:
-    return move.L * jnp.concatenate([jnp.exp(levels), jnp.ones(1, levels.dtype)])[move.level][None, :]
-
-
-def most_rows(model: Any) -> tuple[int, ...]:
-    """The most rows that an epoch has, of each block."""
-    return tuple(int(np.bincount(np.asarray(data.epoch)).max(initial=0)) for data in model.rows)
+    return move.L * waist.level_factors(levels)[move.level][None, :]
 
 
 def merged(model: Any, fill: tuple[Rows, ...], sizes: tuple[int, ...]) -> Epoch:

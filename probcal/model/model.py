@@ -16,8 +16,8 @@ import numpy as np
 
 from probcal.linalg import library
 from probcal.model import rows as waist
-from probcal.model.epochs import Epoch, Stepwise, merged, most_rows
-from probcal.model.rows import Block, Linearised, Rows
+from probcal.model.epochs import Epoch, Stepwise, merged
+from probcal.model.rows import Block, Linearised, LinearRows, Rows
 from probcal.model.sampled import SampledMotion
 from probcal.noise import Normal
 
@@ -183,27 +183,28 @@ class Model(Stepwise):
 
     def innovation(self, at: Where) -> Data:
         """Measured minus predicted, wrapped, zero where missing."""
-        return self._each(waist.innovation, self.predict(at))
+        parts = self.each_block(self.predict(at))
+        return tuple(waist.innovation(block, data, own) for block, data, _, own in parts)
 
     def log_likelihood(self, at: Where) -> Data:
         """Log density of every datum, zero where missing."""
-        return self._each(waist.log_likelihood, self.predict(at), levels=at.levels)
+        return self._at(waist.log_likelihood, at)
 
     def square(self, at: Where) -> Data:
         """Square of what a point leaves of every datum, 1 expected, zero where missing."""
-        return self._each(waist.square, self.predict(at), levels=at.levels)
+        return self._at(waist.square, at)
 
     def reliance(self, at: Where) -> Data:
         """How much each datum counts against one that fits: 1 inlying, towards 0 outlying."""
-        return self._each(waist.reliance, self.predict(at), levels=at.levels)
+        return self._at(waist.reliance, at)
 
     def information(self, at: Where) -> Data:
         """Expected information of every datum about its predicted value, zero where missing."""
-        return self._each(waist.information, self.predict(at), levels=at.levels)
+        return self._at(waist.information, at)
 
     def level_score(self, at: Where) -> Data:
         """One plus the derivative of each log density by log std, zero where missing."""
-        return self._each(waist.level_score, self.predict(at), levels=at.levels)
+        return self._at(waist.level_score, at)
 
     def parameter_score(
         self, predicted: Data, levels: jax.Array, spread: Data
@@ -219,18 +220,15 @@ class Model(Stepwise):
 
     def slopes(self, at: Where) -> tuple[tuple[jax.Array, jax.Array], ...]:
         """Score of every datum by its predicted value and its observed information, a pair for each block."""
-        return self._each(waist.slopes, self.predict(at), levels=at.levels)
+        return self._at(waist.slopes, at)
 
     def score(self, at: Where) -> tuple[tuple[jax.Array, jax.Array], ...]:
         """Score of every datum by its predicted value and the expected information, a pair for each block."""
-        return tuple(
-            waist.weigh(block, data, predicted, at.levels, expected=True)
-            for block, data, _, predicted in self.each_block(self.predict(at))
-        )
+        return self._at(partial(waist.weigh, expected=True), at)
 
     def spread_of_noise(self, at: Where) -> Data:
         """Noise std of every datum at a point."""
-        return self._each(waist.std_at, self.predict(at), levels=at.levels)
+        return self._at(waist.std_at, at)
 
     def noise_std(self, levels: jax.Array) -> Data:
         """Noise std of every datum at log levels (H,)."""
@@ -243,7 +241,7 @@ class Model(Stepwise):
             for b, (block, data, _, predicted) in enumerate(self.each_block(self.predict(at)))
         )
 
-    def linearise(self, at: Where, *, expected: Any) -> tuple[Linearised, ...]:
+    def linearise(self, at: Where, *, expected: Any) -> LinearRows:
         """Every block linearised at a point, with step weights or the expected information.
 
         Raises `InputError` where a motion has no linear form.
@@ -254,7 +252,7 @@ class Model(Stepwise):
             for block, data, r in self.each_block()
         )
 
-    def linearise_biases(self, at: Where, *, expected: bool) -> tuple[Linearised, ...]:
+    def linearise_biases(self, at: Where, *, expected: bool) -> LinearRows:
         """Every block linearised by the biases alone, whatever the motion: `of_biases` reads it."""
         return tuple(
             waist.linearise_biases(block, data, self.vectors(r, at.states[r]), at.z, at.levels, expected=expected)
@@ -417,11 +415,7 @@ class Model(Stepwise):
     @property
     def noises(self) -> tuple[tuple[Any, ...], ...]:
         """Noise family of each channel of each block."""
-        return tuple(tuple(channel.noise for channel in block.channels) for block in self.blocks)
-
-    def noises_at(self, levels: Any) -> tuple[tuple[Any, ...], ...]:
-        """The same with the values of unknown parameters; of parameters by sensor, the middle ones."""
-        return tuple(tuple(waist.families_at(block, np.asarray(levels))) for block in self.blocks)
+        return tuple(block.noises for block in self.blocks)
 
     @property
     def weighs_as_expected(self) -> bool:
@@ -517,7 +511,7 @@ class Model(Stepwise):
     @property
     def sizes(self) -> tuple[int, ...]:
         """The most rows that an epoch has, of each block."""
-        return most_rows(self)
+        return tuple(int(np.bincount(np.asarray(data.epoch)).max(initial=0)) for data in self.rows)
 
     # other models of the same form
 
@@ -541,12 +535,13 @@ class Model(Stepwise):
         changed = (data._replace(**changes(data, *own)) for _, data, _, *own in self.each_block(*of_each))
         return replace(self, rows=tuple(changed))
 
-    def _each(self, function: Any, predicted: Data, **given: Any) -> tuple[Any, ...]:
-        """A function of a block, its rows and its predicted values, for every block."""
-        return tuple(function(block, data, own, **given) for block, data, _, own in self.each_block(predicted))
+    def _at(self, function: Any, at: Where) -> tuple[Any, ...]:
+        """A function of a block, its rows, its predicted values and the levels, for every block."""
+        parts = self.each_block(self.predict(at))
+        return tuple(function(block, data, own, at.levels) for block, data, _, own in parts)
 
 
-def scaled(lins: Sequence[Linearised], weights: Sequence[Any]) -> tuple[Linearised, ...]:
+def scaled(lins: Sequence[Linearised], weights: Sequence[Any]) -> LinearRows:
     """Rows linearised with every datum counted by a weight (N, C)."""
     pairs = zip(lins, weights, strict=True)
     return tuple(lin._replace(score=lin.score * w, weight=lin.weight * w) for lin, w in pairs)

@@ -36,7 +36,7 @@ def padded_model(model: Model) -> Model:
 
     def longer(part: Recursion) -> Recursion:
         E, n = part.drift.shape
-        found: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[padded_index(E)], part)
+        found = jax.tree.map(lambda leaf: np.asarray(leaf)[padded_index(E)], part)
         still = {"F": np.eye(n), "L": 0.0, "level": len(model.level_spread), "drift": 0.0, "dt": 0.0, "first": False}
         for name, value in still.items():
             getattr(found, name)[E:] = value
@@ -46,7 +46,7 @@ def padded_model(model: Model) -> Model:
 
     def masked(data: Rows) -> Rows:
         N = len(data.y)
-        found: Any = data._replace(**{name: np.asarray(getattr(data, name))[padded_index(N)] for name in BY_ROW})
+        found = data._replace(**{name: np.asarray(getattr(data, name))[padded_index(N)] for name in BY_ROW})
         found.mask[N:] = 0.0
         return found
 

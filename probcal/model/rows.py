@@ -74,6 +74,11 @@ class Block:
         """Scalar channels in order."""
         return tuple(channel for _, channel in self.type.expand(self.dimension))
 
+    @property
+    def noises(self) -> tuple[Any, ...]:
+        """Noise family of each channel."""
+        return tuple(channel.noise for channel in self.channels)
+
 
 class Rows(NamedTuple):
     """Numbers of a block: N rows of C channels by S sensors with p biases and nodes of P pose entries each.
@@ -104,6 +109,9 @@ class Linearised(NamedTuple):
     weight: jax.Array  # (N, C) step weight or expected information
     state: jax.Array  # (N, C, used) Jacobian by the state entries in `used`
     bias: jax.Array  # (N, C, p) Jacobian by z
+
+
+LinearRows = tuple[Linearised, ...]  # of each block
 
 
 def make_block(network: Network, kind: SensorType, layout: Layout, flow: tuple[Any, ...] = ()) -> Block:
@@ -192,7 +200,7 @@ def pose_vector(
 
     Rows were `moved` (N,) by what is known of their clock, and count `pose.time` from `begin` on.
     """
-    zero: dict[str, Any] = {"velocity": np.zeros(node.dimension), **dict.fromkeys(MOVING[1:], 0.0)}
+    zero = {"velocity": np.zeros(node.dimension), **dict.fromkeys(MOVING[1:], 0.0)}
     still = {"position": node.position, **zero} | node.components
     stated = {name: np.broadcast_to(value, (len(time), *np.shape(value))) for name, value in still.items()}
     stated |= {"time": time - begin, "time_offset": stated["time_offset"] - moved}
@@ -324,8 +332,12 @@ def _with_memory(block: Block, rows: Rows, states: jax.Array, predicted: jax.Arr
 
 def noise_std(rows: Rows, levels: jax.Array) -> jax.Array:
     """Noise levels (N, C), with the estimated log factors of the unknown ones."""
-    factors = jnp.concatenate([jnp.exp(levels), jnp.ones(1, levels.dtype)])
-    return rows.std * factors[rows.level]
+    return rows.std * level_factors(levels)[rows.level]
+
+
+def level_factors(levels: jax.Array) -> jax.Array:
+    """Factors (H + 1,) of log levels (H,), 1 of known ones last."""
+    return jnp.concatenate([jnp.exp(levels), jnp.ones(1, levels.dtype)])
 
 
 def std_at(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
@@ -352,7 +364,7 @@ def _families(
         log = jnp.asarray(levels)[places]
         log = log if offset is None else log + offset[:, k]
         values.setdefault(own.channel, {})[own.name] = level_at(own.guess, own.odds, log)
-    families: list[Any] = [channel.noise for channel in block.channels]
+    families = list(block.noises)
     for c, own_values in values.items():
         families[c] = with_values(families[c], own_values)
     for c in block.growing if block.at_measured else ():
@@ -362,7 +374,7 @@ def _families(
 
 def families_at(block: Block, levels: np.ndarray) -> list[Any]:
     """Noise family of each channel with numbers for its unknown parameters, in the middle of those of its sensors."""
-    families: list[Any] = [channel.noise for channel in block.channels]
+    families = list(block.noises)
     for own in (own for own in block.unknown if own.name):
         value = level_at(own.guess, own.odds, float(levels[list(own.number)].mean()))
         families[own.channel] = with_values(families[own.channel], {own.name: float(value)})
@@ -383,25 +395,24 @@ def _by_channel(
 
 def innovation(block: Block, rows: Rows, predicted: jax.Array) -> jax.Array:
     """Measured minus predicted, wrapped, zero where missing, shape (N, C)."""
-    families: list[Any] = [channel.noise for channel in block.channels]
-    return rows.mask * _by_channel(block, families, "innovation", rows.y, predicted)
+    return rows.mask * _by_channel(block, block.noises, "innovation", rows.y, predicted)
+
+
+def _measured(block: Block, rows: Rows, method: str, predicted: jax.Array, levels: jax.Array) -> jax.Array:
+    """A method of each channel's noise family at the measured values, zero where missing, (N, C)."""
+    families = _families(block, rows, levels)
+    return rows.mask * _by_channel(block, families, method, rows.y, predicted, noise_std(rows, levels))
 
 
 @partial(jax.jit, static_argnames="block")
 def log_likelihood(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
     """Log density of every datum, zero where missing, shape (N, C)."""
-
-    def look(own: Rows, values: jax.Array) -> jax.Array:
-        families = _families(block, own, levels)
-        return own.mask * _by_channel(block, families, "log_likelihood", own.y, values, noise_std(own, levels))
-
-    return by_parts(look, rows, predicted)
+    return by_parts(lambda own, values: _measured(block, own, "log_likelihood", values, levels), rows, predicted)
 
 
 def level_score(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
     """One plus the derivative of each log density by log std, zero where missing, shape (N, C)."""
-    families = _families(block, rows, levels)
-    return rows.mask * _by_channel(block, families, "level_score", rows.y, predicted, noise_std(rows, levels))
+    return _measured(block, rows, "level_score", predicted, levels)
 
 
 def information(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
@@ -501,20 +512,16 @@ def _linearised(
     (by_state, by_bias), predicted = jax.vmap(both)(entries, reached, rows.pose, local)
     if block.memory:
         predicted = _with_memory(block, rows, reached, predicted)
-        by_state = _by_memory(block, rows, by_state)
+        # jacobian (N, C, used) by the state entries in `used` from that by the entries in `seen`
+        N, C, _ = by_state.shape
+        places = np.searchsorted(block.used, block.seen)
+        found = jnp.zeros((N, C, len(block.used))).at[:, :, places].set(by_state)
+        for c, own in block.memory:
+            place = jnp.asarray(np.searchsorted(block.used, own))[rows.sensor % len(own)]
+            found = found.at[jnp.arange(N), c, place].set(1.0)
+        by_state = found
     score, weight = weigh(block, rows, predicted, levels, expected=expected)
     return Linearised(score, weight, by_state, by_bias * rows.scale[rows.sensor][:, None, :])
-
-
-def _by_memory(block: Block, rows: Rows, by_state: jax.Array) -> jax.Array:
-    """Jacobian (N, C, used) by the state entries in `used` from that by the entries in `seen`."""
-    N, C, _ = by_state.shape
-    places = np.searchsorted(block.used, block.seen)
-    found = jnp.zeros((N, C, len(block.used))).at[:, :, places].set(by_state)
-    for c, entries in block.memory:
-        place = jnp.asarray(np.searchsorted(block.used, entries))[rows.sensor % len(entries)]
-        found = found.at[jnp.arange(N), c, place].set(1.0)
-    return found
 
 
 @partial(jax.jit, static_argnames=("block", "expected"))
@@ -543,7 +550,7 @@ def curvature(block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels:
         predicted = _with_memory(block, one, state[None], _one(block, state, row.pose, b)[None])
         return jnp.sum(log_likelihood(block, one, predicted, levels))
 
-    whole: Any = Rows(*(0 if name in BY_ROW else None for name in Rows._fields))  # type: ignore[arg-type]
+    whole = Rows(*(0 if name in BY_ROW else None for name in Rows._fields))  # type: ignore[arg-type]
     second = jax.vmap(jax.jacfwd(jax.grad(density)), (0, 0, whole))(local, states[rows.epoch], rows)
     return -second * scale[:, :, None] * scale[:, None, :]
 
@@ -565,7 +572,7 @@ def square(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) ->
     for c in block.growing:
         own = families[c].square(rows.y[:, c], predicted[:, c], std[:, c])
         found = found.at[:, c].set(jnp.where(rows.mask[:, c] > 0, own, 0.0))
-    events = np.array([isinstance(channel.noise, Bernoulli) for channel in block.channels])
+    events = np.array([isinstance(noise, Bernoulli) for noise in block.noises])
     if not events.any():
         return found
     return jnp.where(events, jnp.minimum(found, -2.0 * log_likelihood(block, rows, predicted, levels)), found)
@@ -601,8 +608,7 @@ def slopes(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) ->
 
 def reliance(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
     """How much each datum counts against one that fits: 1 inlying, towards 0 outlying, (N, C)."""
-    families = _families(block, rows, levels)
-    return rows.mask * _by_channel(block, families, "reliance", rows.y, predicted, noise_std(rows, levels))
+    return _measured(block, rows, "reliance", predicted, levels)
 
 
 def difference(block: Block, value: jax.Array, other: jax.Array) -> jax.Array:

@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+States = tuple[jax.Array, ...]  # of every epoch: (E, n), or (E, ...), for each recursion
+
 
 class Trajectories(NamedTuple):
     """States and whitened noises of all targets, one entry per state layout; a pytree."""
@@ -64,7 +66,7 @@ class Loops:
         each of `of_each`."""
         return zip(self.blocks, self.rows, self.recursion, *of_each, strict=True)
 
-    def by_target(self, values: Iterable[jax.Array]) -> tuple[jax.Array, ...]:
+    def by_target(self, values: Iterable[jax.Array]) -> States:
         """Sums (T, ...) of values (E, ...) over the epochs of each target, one per state layout."""
         return self.each(lambda part, own, T: _sums(own, part.target, T), values, self.targets)
 

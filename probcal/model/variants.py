@@ -62,7 +62,7 @@ def aligned(like: Model, later: Model, recursions: Sequence[int | None], targets
         else:
             mine = later.recursions[r]
             found.append(mine._replace(target=np.asarray(names, int)[np.asarray(mine.target)]))
-    own: dict[Any, Rows] = {(block, r): data for block, data, r in later.each_block()}
+    own = {(block, r): data for block, data, r in later.each_block()}
     for block, data, r in like.each_block():
         nothing = {name: np.asarray(getattr(data, name))[:0] for name in BY_ROW}
         rows.append(own.get((block, recursions[r]), data._replace(**nothing)))

@@ -111,7 +111,20 @@ def _triangulated(problem: Problem, seen: list[Directions], turning: Turning) ->
     """Headings for which the lines of sight of all sensors cross, the places taken as stated (triangulation)."""
     place, turn = _stated(problem)
     names = list(dict.fromkeys(s.node for s in seen))
-    table = _at_common_times(seen, names)
+    # azimuths (rows, sensors) at times that two or more sensors share, interpolated between
+    # neighbours; else NaN
+    shared = list[np.ndarray]()
+    for target in dict.fromkeys(s.target for s in seen):
+        mine = [s for s in seen if s.target == target]
+        times = np.unique(np.concatenate([s.time for s in mine]))
+        table = np.full((len(times), len(names)), np.nan)
+        for s in mine:
+            gap = 3 * np.median(np.diff(s.time)) if len(s.time) > 1 else 0.0
+            angle = np.interp(times, s.time, np.unwrap(s.angles[:, 0]))
+            near = np.abs(times[:, None] - s.time).min(1) <= gap
+            table[:, names.index(s.node)] = np.where(near & (times >= s.time[0]) & (times <= s.time[-1]), angle, np.nan)
+        shared.append(table[np.isfinite(table).sum(1) >= 2])
+    table = np.concatenate(shared) if shared else np.zeros((0, len(names)))
     if not len(table):
         return
     there = np.isfinite(table)
@@ -148,22 +161,6 @@ def _headings(problem: Problem, name: str, turn: dict[str, float], turning: Turn
     half = min(3 * spread, np.pi)
     count = max(int(HEADINGS * half / np.pi), 5)
     return turn[name] + np.linspace(-half, half, count, endpoint=half < np.pi)
-
-
-def _at_common_times(seen: list[Directions], names: list[str]) -> np.ndarray:
-    """Azimuths (rows, sensors) at times that two or more sensors share, interpolated between neighbours; else NaN."""
-    rows = []
-    for target in dict.fromkeys(s.target for s in seen):
-        mine = [s for s in seen if s.target == target]
-        times = np.unique(np.concatenate([s.time for s in mine]))
-        table = np.full((len(times), len(names)), np.nan)
-        for s in mine:
-            gap = 3 * np.median(np.diff(s.time)) if len(s.time) > 1 else 0.0
-            angle = np.interp(times, s.time, np.unwrap(s.angles[:, 0]))
-            near = np.abs(times[:, None] - s.time).min(1) <= gap
-            table[:, names.index(s.node)] = np.where(near & (times >= s.time[0]) & (times <= s.time[-1]), angle, np.nan)
-        rows.append(table[np.isfinite(table).sum(1) >= 2])
-    return np.concatenate(rows) if rows else np.zeros((0, len(names)))
 
 
 def _crossed(

@@ -14,8 +14,8 @@ import numpy as np
 from probcal.gaussian.mode import Point
 from probcal.labels import NODE
 from probcal.linalg import solve_square, spectrum
-from probcal.model.model import At, Model
-from probcal.model.rows import Linearised
+from probcal.model.model import At, Data, Model
+from probcal.model.rows import LinearRows
 from probcal.modes.explore import WORSE, Candidate
 from probcal.modes.reflections import FAR, SHIFTED, Plane, node_places, place_biases
 from probcal.problem import Problem
@@ -146,7 +146,7 @@ class _Own:
         node[own] = np.arange(len(own))[:, None]
         node[-1] = -1
         each = [node[np.asarray(read)].max(1, initial=-1) for read in model.read]  # the node of each row, -1 of none
-        information: np.ndarray = np.eye(own.shape[1])
+        information = np.eye(own.shape[1])
         for _ in range(STEPS):
             information, pull = np.tile(np.eye(own.shape[1]), (len(own), 1, 1)), -after[own]
             linearised = _linearised(model, point, jax.device_put(after[:-1]))
@@ -215,11 +215,11 @@ def _parted(heard: list[np.ndarray], moved: list[int]) -> list[list[int]]:
 
 
 @jax.jit
-def _by_row(model: Model, point: Point, z: jax.Array) -> tuple[jax.Array, ...]:
+def _by_row(model: Model, point: Point, z: jax.Array) -> Data:
     """Negative log-likelihood (N,) of the rows of each block."""
     return tuple(-jnp.sum(own, 1) for own in model.log_likelihood(At(point.states, z, point.levels)))
 
 
 @jax.jit
-def _linearised(model: Model, point: Point, z: jax.Array) -> tuple[Linearised, ...]:
+def _linearised(model: Model, point: Point, z: jax.Array) -> LinearRows:
     return model.linearise_biases(At(point.states, z, point.levels), expected=False)

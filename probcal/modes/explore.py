@@ -117,7 +117,7 @@ def explore(problem: Problem, point: Point, climb: SideClimb, proposals: Sequenc
     candidates that fit about as well, are weighed by their evidence; the search goes on from the best.
     """
     given = here = _Here(problem, climb, point)
-    way: tuple[str, str] | None = None
+    way = None
     others: list[Mirrored] = []
     for _ in range(ROUNDS):
         here, moved, near = _moved(here, proposals)
@@ -176,7 +176,7 @@ def _moved(here: _Here, proposals: Sequence[Proposal]) -> tuple[_Here, tuple[str
     Also what fits about as well there, that of the last proposal first.
     """
     near: dict[int, list[_Tried]] = {}
-    way: tuple[str, str] | None = None
+    way = None
     k = moves = 0
     while len(near) < len(proposals):
         better, found = _looked(here, proposals[k])

@@ -17,6 +17,7 @@ from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.mode import Point, apart, factors, gains_of, smooth_tracks
 from probcal.gaussian.search import quiet
+from probcal.geometry import lattice
 from probcal.model import variants
 from probcal.model.model import At, Model, Recursion
 from probcal.model.rows import Linearised
@@ -41,7 +42,6 @@ def candidates(problem: Problem) -> np.ndarray:
     low, high = nodes.min(0), nodes.max(0)
     margin = 0.3 * np.linalg.norm(high - low) + 0.02 * extent
     axes = [np.linspace(a - margin, b + margin, INNER[d]) for a, b in zip(low, high, strict=True)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, d)
     k = np.arange(OUTER[d])
     if d == 2:
         angle = 2 * np.pi * k / OUTER[d]
@@ -52,7 +52,7 @@ def candidates(problem: Problem) -> np.ndarray:
         radius = np.sqrt(1 - height**2)
         directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1)
     rings = [nodes.mean(0) + factor * extent * directions for factor in RINGS]
-    return np.concatenate([grid, *rings])
+    return np.concatenate([lattice(axes), *rings])
 
 
 def _widened(lin: Linearised) -> Linearised:
@@ -193,7 +193,7 @@ def project(problem: Problem, tracks: list[np.ndarray], precision: list[np.ndarr
 
     These have given precisions (E, n); the motion makes the others.
     """
-    levels: Any = np.zeros(len(problem.levels))
+    levels = np.zeros(len(problem.levels))
 
     def consistent(
         part: Recursion, states: np.ndarray, weight: np.ndarray, used: tuple[int, ...]

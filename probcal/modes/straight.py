@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from probcal.gaussian.search import climb_on_host
-from probcal.linalg import pseudo_inverse, singular
+from probcal.linalg import outer, pseudo_inverse, singular
 
 GAMMA = 0.1  # 1/s, prior sd of the radial speed over the range
 STEEP = 1e-6  # cosine of the elevation below which the azimuth has no meaning
@@ -36,22 +36,18 @@ def wrapped(angle: Any) -> Any:
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def sights(angles: np.ndarray) -> np.ndarray:
-    """Unit vectors (T, d) of azimuths (T, 1), or of azimuths and elevations (T, 2)."""
-    b, e = angles[:, 0], angles[:, 1] if angles.shape[1] == 2 else np.zeros(len(angles))
-    whole = np.stack([np.cos(e) * np.cos(b), np.cos(e) * np.sin(b), np.sin(e)], 1)
-    return whole[:, : angles.shape[1] + 1]
-
-
 def straight_track(time: np.ndarray, angles: np.ndarray, std: np.ndarray, gamma: float = GAMMA) -> StraightTrack:
     """The path whose directions are (T, 1) or (T, 2) angles in rad, with their stds; the best of two starts.
 
     One start is the path that the lines of sight miss least, which is linear; the other has the rates of the first two.
     """
     span = max(float(np.ptp(time)), 1e-300)
-    t, u = (time - time[1]) / span, sights(angles)
+    # unit vectors (T, d) of azimuths (T, 1), or of azimuths and elevations (T, 2)
+    b, e = angles[:, 0], angles[:, 1] if angles.shape[1] == 2 else np.zeros(len(angles))
+    whole = np.stack([np.cos(e) * np.cos(b), np.cos(e) * np.sin(b), np.sin(e)], 1)
+    t, u = (time - time[1]) / span, whole[:, : angles.shape[1] + 1]
     d = u.shape[1]
-    across = np.eye(d) - u[:, :, None] * u[:, None, :]
+    across = np.eye(d) - outer(u)
     linear = singular((across @ _along(t, 2 * d)).reshape(-1, 2 * d))[2][-1]
     if np.sum(u * (_along(t, 2 * d) @ linear)) < 0:
         linear = -linear

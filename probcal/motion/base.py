@@ -9,7 +9,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, cast
 
@@ -266,7 +265,8 @@ class LinearMotion(Motion):
     def _start(self, dimension: int, start: Start) -> tuple[jax.Array, jax.Array]:
         """Mean (n,) at the start and the root of its covariance (n, m)."""
         means, roots = self._means(dimension), []
-        for component, (_, stop) in zip(self.components, self._spans(dimension), strict=True):
+        ends = np.cumsum([layout_of([c], dimension)[-1][2] for c in self.components]).tolist()
+        for component, stop in zip(self.components, ends, strict=True):
             if component.memoryless:
                 roots.append(guess_of(component.std) * component.noise_factor(np.ones(1), dimension))
                 continue
@@ -280,11 +280,6 @@ class LinearMotion(Motion):
             means = means.at[stop - len(mean) : stop].set(mean)
             roots.append(np.diag(std)[None])
         return means, _diagonal(roots)[0]
-
-    def _spans(self, dimension: int) -> list[tuple[int, int]]:
-        """First and last (excluded) entry of each component in the state."""
-        ends = np.cumsum([0, *(layout_of([c], dimension)[-1][2] for c in self.components)]).tolist()
-        return list(pairwise(ends))
 
 
 @dataclass(frozen=True)

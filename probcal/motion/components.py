@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from probcal.errors import InputError
 from probcal.motion.base import GAUSSIAN, Component
 from probcal.motion.target import check_pair
-from probcal.noise import Level, check_driving, check_level, guess_of
+from probcal.noise import Level, check_driven, guess_of
 
 PLANE, QUARTER, UP = np.diag([1.0, 1.0, 0.0]), np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]), np.diag([0.0, 0, 1])
 
@@ -35,15 +35,14 @@ class ConstantVelocity(Component):
     `singular=True`: `std` in m s^-2, G = [T^2/2, T], the rank-deficient form of the papers.
     """
 
-    next_order: ClassVar[str] = "ConstantAcceleration(std)"
+    next_order = "ConstantAcceleration(std)"
 
     std: Level
     singular: bool = False
     noise: Any = GAUSSIAN
 
     def __post_init__(self):
-        check_level(self.std, "ConstantVelocity: std", zero=True)
-        check_driving(self.noise, "ConstantVelocity: noise")
+        check_driven(self, "ConstantVelocity:")
 
     def names(self) -> tuple[tuple[str, bool], ...]:
         """State components and whether each has one value an axis."""
@@ -75,8 +74,7 @@ class ConstantAcceleration(Component):
     noise: Any = GAUSSIAN
 
     def __post_init__(self):
-        check_level(self.std, "ConstantAcceleration: std", zero=True)
-        check_driving(self.noise, "ConstantAcceleration: noise")
+        check_driven(self, "ConstantAcceleration:")
 
     def names(self) -> tuple[tuple[str, bool], ...]:
         """State components and whether each has one value an axis."""
@@ -107,21 +105,18 @@ class CoordinatedTurn(Component):
     the z axis, are constant velocity.
     """
 
-    next_order: ClassVar[str] = "another rate, or ConstantAcceleration(std)"
+    next_order = "another rate, or ConstantAcceleration(std)"
 
     std: Level
     rate: float
     noise: Any = GAUSSIAN
 
     def __post_init__(self):
-        check_level(self.std, "CoordinatedTurn: std", zero=True)
-        check_driving(self.noise, "CoordinatedTurn: noise")
+        check_driven(self, "CoordinatedTurn:")
         if not np.isfinite(self.rate):
             raise InputError(f"CoordinatedTurn: rate is {self.rate!r}: give a finite number in rad/s")
 
-    def names(self) -> tuple[tuple[str, bool], ...]:
-        """State components and whether each has one value an axis."""
-        return (("position", True), ("velocity", True))
+    names = ConstantVelocity.names
 
     def transition(self, dt: Any, dimension: int) -> Any:
         """Transition matrices, shape (E, 2d, 2d); x + iy has velocity exp(i rate T)."""
@@ -168,7 +163,7 @@ def _turn_variance(angle: Any) -> Any:
 class Static(Component):
     """A target that does not move: all its rows form one epoch."""
 
-    static: ClassVar[bool] = True
+    static = True
 
     std: Level = 0.0
 
@@ -212,9 +207,8 @@ class RandomWalk(OneComponent):
     noise: Any = GAUSSIAN
 
     def __post_init__(self):
-        check_level(self.std, f'RandomWalk("{self.name}"): std', zero=True)
+        check_driven(self, f'RandomWalk("{self.name}"):')
         check_pair(self.initial, f'RandomWalk("{self.name}"): initial')
-        check_driving(self.noise, f'RandomWalk("{self.name}"): noise')
 
     def transition(self, dt: Any, dimension: int) -> Any:
         """Identity, shape (E, s, s)."""
@@ -236,8 +230,8 @@ class Remembered(OneComponent):
     `level` is the label of its std.
     """
 
-    stationary: ClassVar[bool] = True
-    next_order: ClassVar[str] = "another time of its Memory(std, time)"
+    stationary = True
+    next_order = "another time of its Memory(std, time)"
 
     name: str
     std: Level
@@ -262,8 +256,8 @@ class Remembered(OneComponent):
 class White(OneComponent):
     """A component drawn anew at every epoch (an unknown emission range, say): `mean` (one or one an axis), `std`."""
 
-    memoryless: ClassVar[bool] = True
-    next_order: ClassVar[str] = "RandomWalk(name, unit, std, initial)"
+    memoryless = True
+    next_order = "RandomWalk(name, unit, std, initial)"
 
     name: str
     unit: str
@@ -273,8 +267,7 @@ class White(OneComponent):
     noise: Any = GAUSSIAN
 
     def __post_init__(self):
-        check_level(self.std, f'White("{self.name}"): std')
-        check_driving(self.noise, f'White("{self.name}"): noise')
+        check_driven(self, f'White("{self.name}"):', zero=False)
 
     def transition(self, dt: Any, dimension: int) -> Any:
         """Zero, shape (E, s, s): nothing is kept."""

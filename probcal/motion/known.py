@@ -7,13 +7,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from probcal.errors import InputError, nearest
+from probcal.errors import InputError, check_known
 from probcal.geometry import slopes
 from probcal.labels import AXES
 from probcal.lazy import pd
 from probcal.motion.base import GAUSSIAN, Component
-from probcal.motion.components import blocks
-from probcal.noise import Level, check_driving, check_level
+from probcal.motion.components import ConstantVelocity, blocks
+from probcal.noise import Level, check_driven
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,10 +30,10 @@ class Known(Component):
     0.02
     """
 
-    memoryless: ClassVar[bool] = True
-    timed: ClassVar[bool] = True
+    memoryless = True
+    timed = True
     driven: ClassVar[str] = "position"
-    next_order: ClassVar[str] = (
+    next_order = (
         "its reports as rows of a sensor with biases, sensors.position.on(Node(...)), and ConstantVelocity(std)"
     )
 
@@ -44,8 +44,7 @@ class Known(Component):
     state: np.ndarray = field(init=False, repr=False)  # (T, 2d) positions, velocities
 
     def __post_init__(self):
-        check_level(self.std, "Known: std", zero=True)
-        check_driving(self.noise, "Known: noise")
+        check_driven(self, "Known:")
         time, position, velocity = _track(self.track)
         if time.ndim != 1 or position.ndim != 2 or len(position) != len(time) or position.shape[1] not in (2, 3):
             raise InputError(
@@ -61,9 +60,7 @@ class Known(Component):
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "state", state)
 
-    def names(self) -> tuple[tuple[str, bool], ...]:
-        """State components and whether each has one value an axis."""
-        return (("position", True), ("velocity", True))
+    names = ConstantVelocity.names
 
     def transition(self, dt: Any, dimension: int) -> Any:
         """Zero, shape (E, 2d, 2d): every epoch is known by itself."""
@@ -102,8 +99,7 @@ def _track(given: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     if any(column.startswith("velocity_") for column in map(str, given.columns)):
         wanted += [f"velocity_{axis}" for axis in axes]
     for column in wanted:
-        if column not in given:
-            raise InputError(f'Known: the track has no column "{column}"{nearest(column, given.columns)}')
+        check_known(column, given.columns, f'Known: the track has no column "{column}"')
     try:
         values = given[wanted].to_numpy(float)
     except (TypeError, ValueError):

@@ -75,7 +75,7 @@ def flow_of(components: Iterable[Any], dimension: int) -> tuple[Any, ...]:
         known = TargetView("the target", {name: eye[start:stop] for name, start, stop, _ in layout}).at(dt)
         same = np.concatenate([getattr(known, name) for name, *_ in layout])
         if not np.allclose(part.transition(np.full(1, dt), dimension)[0], same, atol=1e-12):
-            declared: Any = part
+            declared = part
             found.append(replace(declared, std=1.0) if is_dataclass(part) and hasattr(part, "std") else part)
     return tuple(found)
 

@@ -13,10 +13,10 @@ import numpy as np
 from probcal import linalg
 from probcal.gaussian.mode import Point
 from probcal.gaussian.search import halved
-from probcal.inference.em import EM
+from probcal.inference.em import EM, RIDGE
 from probcal.inference.loop import Pause, Trace
 from probcal.inference.method import Context, Given, MethodTask
-from probcal.inference.run import bare, check_method, given_of, learn
+from probcal.inference.run import CHUNK, bare, check_method, given_of, learn
 from probcal.model.model import At, Model
 from probcal.particles.ensemble import (
     Ensemble,
@@ -37,11 +37,9 @@ from probcal.priors import Gaussian, Precision, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 
-CHUNK = 5  # iterations between two reports of progress
 SETTLING = 10  # iterations of stochastic approximation before it averages
 POWER = 0.7  # by which the weights of later passes fall
 COOL = 0.02  # by which the log-likelihood counts at first, where it is tempered
-RIDGE = 1e-12  # of the information, where a flat prior meets a bias that no row reads
 WINDOW = 20  # iterations that are compared with as many before them
 DRIFT = 4.0  # standard errors by which these may differ, beside
 NEAR = 0.25  # so many sd of a bias

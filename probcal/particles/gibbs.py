@@ -22,6 +22,7 @@ from probcal.inference.chains import Draw, Sample, repeated
 from probcal.inference.draws import slice_step
 from probcal.inference.gibbs import draw_hyper
 from probcal.inference.hierarchy import Phi, hierarchy_of
+from probcal.inference.pose import SPREAD
 from probcal.inference.posed import Form, Natural, conditional, log_prior, prior_precision
 from probcal.inference.posterior import SamplerRun, chains, conclude_draws
 from probcal.inference.sampler import Sampler
@@ -40,7 +41,6 @@ from probcal.priors import Horseshoe, Prior
 from probcal.problem import Problem
 from probcal.results.answer import Answer, Posterior
 
-SPREAD = 1.5  # by how much chains start further out than the data leave the biases
 SEARCH = 40  # iterations of the search for a start, where there is none
 LENGTHS = (1.0, 0.3)  # of steps of all biases; 1 is an independent draw from the Gaussian at given paths
 NEAR, FAR = 0.2, 20.0  # shortest and longest steps of a sensor by itself, in sd at given paths
@@ -117,13 +117,12 @@ def run_particle_sweeps(method: ParticleGibbs, form: Form, held: Held, chain: Gi
 @partial(jax.jit, static_argnames=("form", "how"))
 def begin_chains(form: Form, how: Particles, held: Held, theta: Any, keys: jax.Array) -> GibbsState:
     """States of chains (chains leading) about theta (Q,), on paths that particles draw there."""
-    M = form.biases
 
     def one(key: jax.Array) -> GibbsState:
         seeds = jax.random.split(key, 4)
         phi = form.hierarchy.draw(seeds[0])
         place = theta + SPREAD * conditional(form, held.natural, phi).deviation(seeds[1])
-        found = ensemble(held.model, held.targets, place[:M], place[M:], seeds[2], how)
+        found = ensemble(held.model, held.targets, *jnp.split(place, [form.biases]), seeds[2], how)
         return GibbsState(place, phi, first_paths(held.targets, found), jax.random.key_data(seeds[3]))
 
     return jax.lax.map(one, keys)
@@ -154,7 +153,7 @@ class ParticleChains(Chains):
         self.posed = natural = Natural(
             jnp.asarray(np.pad(told.information, (0, H))),
             jnp.asarray(np.pad(told.information @ z + told.score, (0, H))),
-            problem.model.level_spread, prior.precision(problem.labels, problem.surveyed),
+            problem.model.level_spread, problem.first_precision(prior),
         )  # fmt: skip
         self.form = Form(self.biases, hierarchy_of(prior, problem))
         group, of_sensor = groups_of(problem.model, np.asarray(natural.first.coupled()))

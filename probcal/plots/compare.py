@@ -26,7 +26,7 @@ from probcal.plots.base import (
     write_figure,
 )
 from probcal.results.blocks import SensorBlocks
-from probcal.results.read import known_truth
+from probcal.results.read import known_truth, listed_in
 from probcal.status import INVALID
 
 SCATTER = 2_000  # draws of one fit in the picture of a pair
@@ -131,9 +131,9 @@ def draw_compare(
 
     `fits` are those compared; where no pair is given the most interchangeable ones of the reference are drawn.
     """
-    names = comparison["estimate"].to_dataset()["estimator"].values.tolist()
+    names = listed_in(comparison, "estimate", "estimator")
     known = fits_by_name(list(fits.values()) if isinstance(fits, Mapping) else fits, names)
-    labels = comparison["estimate"].to_dataset()["bias_label"].values.tolist()
+    labels = listed_in(comparison, "estimate", "bias_label")
     if not pairs:
         found = interchangeable(known[str(comparison.attrs["reference"])], count=PAIRS, among=labels)
         pairs = [(first, second) for first, second, _ in found]

@@ -7,7 +7,6 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -60,7 +59,10 @@ def plot_biases(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
             ax.text(1.01, row, status, transform=ax.get_yaxis_transform(), va="center", fontsize=8, color=tint)
     name_rows(ax, frame.index)
     scale_axis(ax, *known[["lower", "upper", "true"]].to_numpy().T)
-    _gamma_bar(ax, dots)
+    # add the colour bar of gamma below the axes, at a distance that does not grow with the rows
+    height = max(ax.figure.bbox.height / ax.figure.dpi - 1.5, 1.0)
+    bar = ax.inset_axes((0.25, -0.75 / height, 0.5, 0.12 / height))
+    ax.figure.colorbar(dots, cax=bar, orientation="horizontal", label="gamma (0 prior only, 1 data only)")
     shown = f"{len(rows)} of {total} biases: the largest |mean| / scale, and any invalid"
     title = (shown if len(rows) < total else f"{total} biases") + (" (cross: true value)" if scored else "")
     text = f"bias in units of its scale, {probability(tree):.0%} interval"
@@ -76,7 +78,24 @@ def plot_residuals(tree: xr.DataTree, axes: Sequence[Axes] | None = None) -> lis
         figure = Figure(figsize=(9.0 if columns > 1 else 6.0, height), layout="constrained")
         axes = panels(figure, len(channels), columns)
     for ax, (channel, frame) in zip(axes, channels, strict=True):
-        _draw_residuals(ax, str(channel), frame)
+        # draw both histograms of one channel over the standard normal density
+        usable = frame[["before", "after"]].div(frame["std"].where(frame["std"] > 0), axis=0)
+        ratios = {kind: usable[kind].dropna() for kind in usable}
+        sizes = [ratio.abs().quantile(0.98) for ratio in ratios.values() if len(ratio)]
+        limit = float(np.clip(max(sizes, default=4.0), 4.0, 12.0))  # holds 98 % of the data, within 4 to 12 std
+        edges = np.linspace(-limit, limit, 61)
+        forms: Any = ("stepfilled", "step")
+        for (kind, ratio), form, tint in zip(ratios.items(), forms, ("0.78", COLOURS[0]), strict=True):
+            outside = int((ratio.abs() > limit).sum())
+            label = kind + (f" ({outside} outside)" if outside else "")
+            weights = np.full(len(ratio), 1 / (max(len(ratio), 1) * (edges[1] - edges[0])))
+            if len(ratio):
+                ax.hist(ratio, edges.tolist(), weights=weights, label=label, histtype=form, color=tint, linewidth=1.5)
+        x = np.linspace(-limit, limit, 241)
+        ax.plot(x, np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi), "--", color="0.15", linewidth=1.0, label="standard normal")
+        ax.set(xlim=(-limit, limit), ylim=(0.0, 1.45 * ax.get_ylim()[1]), xlabel="residual / std", ylabel="density")
+        ax.set_title(f"{plain_text(str(channel))} ({len(frame)} data)", loc="left", fontsize=10)
+        ax.legend(fontsize=7, frameon=False, loc="upper right")
     return list(axes)
 
 
@@ -153,31 +172,3 @@ def _kind(label: str) -> str:
     """Name of a bias without its owner: `heading` of `radar_2.heading`, `heading_step` of `radar_2.heading@0.5`."""
     name, _, time = label_parts(label)[1].partition("@")
     return f"{name}_step" if time else name
-
-
-def _gamma_bar(ax: Axes, dots: ScalarMappable) -> None:
-    """Add the colour bar of gamma below the axes, at a distance that does not grow with the rows."""
-    height = max(ax.figure.bbox.height / ax.figure.dpi - 1.5, 1.0)
-    bar = ax.inset_axes((0.25, -0.75 / height, 0.5, 0.12 / height))
-    ax.figure.colorbar(dots, cax=bar, orientation="horizontal", label="gamma (0 prior only, 1 data only)")
-
-
-def _draw_residuals(ax: Axes, channel: str, frame: Any) -> None:
-    """Draw both histograms of one channel over the standard normal density."""
-    usable = frame[["before", "after"]].div(frame["std"].where(frame["std"] > 0), axis=0)
-    ratios = {kind: usable[kind].dropna() for kind in usable}
-    sizes = [ratio.abs().quantile(0.98) for ratio in ratios.values() if len(ratio)]
-    limit = float(np.clip(max(sizes, default=4.0), 4.0, 12.0))  # holds 98 % of the data, within 4 to 12 std
-    edges = np.linspace(-limit, limit, 61)
-    forms: Any = ("stepfilled", "step")
-    for (kind, ratio), form, tint in zip(ratios.items(), forms, ("0.78", COLOURS[0]), strict=True):
-        outside = int((ratio.abs() > limit).sum())
-        label = kind + (f" ({outside} outside)" if outside else "")
-        weights = np.full(len(ratio), 1 / (max(len(ratio), 1) * (edges[1] - edges[0])))
-        if len(ratio):
-            ax.hist(ratio, edges.tolist(), weights=weights, label=label, histtype=form, color=tint, linewidth=1.5)
-    x = np.linspace(-limit, limit, 241)
-    ax.plot(x, np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi), "--", color="0.15", linewidth=1.0, label="standard normal")
-    ax.set(xlim=(-limit, limit), ylim=(0.0, 1.45 * ax.get_ylim()[1]), xlabel="residual / std", ylabel="density")
-    ax.set_title(f"{plain_text(channel)} ({len(frame)} data)", loc="left", fontsize=10)
-    ax.legend(fontsize=7, frameon=False, loc="upper right")

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from probcal.errors import InputError, nearest
+from probcal.errors import check_known
 from probcal.plots.base import BEFORE, SURE, colour, panels, plain_text, write_figure
 
 COLUMNS, PANELS = 4, 24  # panels of a row, and at most
@@ -29,12 +29,10 @@ def plot_history(
     1
     """
     for column in ("time", "bias", "unit", "mean", "sd", "lower", "upper"):
-        if column not in history:
-            raise InputError(f'plot_history: the history has no column "{column}"{nearest(column, map(str, history))}')
+        check_known(column, list(map(str, history)), f'plot_history: the history has no column "{column}"')
     last = history.drop_duplicates("bias", keep="last").set_index("bias")
     for label in labels or ():
-        if label not in last.index:
-            raise InputError(f'plot_history: no bias is called "{label}"{nearest(label, last.index)}')
+        check_known(label, last.index, f'plot_history: no bias is called "{label}"')
     far = (last["mean"].abs() / last["sd"]).sort_values(ascending=False).index[:PANELS]
     chosen = list(labels) if labels else [label for label in last.index if label in set(far)]
     rows = -(-len(chosen) // COLUMNS)

@@ -91,7 +91,7 @@ def _sources(tree: xr.DataTree, shown: Scene) -> dict[str, ColumnDataSource]:
     """Columns that all panels share: epochs, nodes."""
     nodes, d = shown.nodes, shown.dimension
     tracks, sizes = shown.tracks, [len(track.time) for track in shown.tracks]
-    epochs: dict[str, Any] = {
+    epochs = {
         "target": np.repeat([track.target for track in tracks], sizes).tolist(),
         "time": np.concatenate([np.empty(0), *(track.time for track in tracks)]),
         "colour": np.repeat([colour(k) for k in range(len(tracks))], sizes).tolist(),
@@ -100,7 +100,7 @@ def _sources(tree: xr.DataTree, shown: Scene) -> dict[str, ColumnDataSource]:
     sds = np.concatenate([np.empty((0, d)), *(track.sd for track in tracks)]).astype("f4")
     for axis in range(d):
         epochs[AXES[axis]], epochs[f"sd_{AXES[axis]}"] = places[:, axis], sds[:, axis]
-    points: dict[str, Any] = {"name": nodes.name.tolist(), "words": list(_words(tree, shown))}
+    points = {"name": nodes.name.tolist(), "words": list(_words(tree, shown))}
     for axis in range(d):
         points[AXES[axis]], points[f"to_{AXES[axis]}"] = nodes.stated[:, axis], nodes.calibrated[:, axis]
     return {"epochs": ColumnDataSource(data=epochs), "nodes": ColumnDataSource(data=points)}
@@ -145,7 +145,14 @@ def _panel(shown: Scene, sources: dict[str, ColumnDataSource], axes: tuple[int, 
     sheet.grid.visible = not flat or shown.frame is None
     sheet.grid.grid_line_color, sheet.grid.grid_line_alpha = MIDDLE, 0.25
     if flat and shown.frame is not None:
-        _draw_graticule(sheet, shown.frame, low, high, shown.dimension)
+        # meridians and parallels at round degrees over three times the map, named where they enter it
+        lines: list[Any] = list(graticule(shown.frame, low, high, shown.dimension))
+        xs, ys = ([line[:, axis] for _, line in lines] for axis in (0, 1))
+        sheet.multi_line(xs, ys, line_color=MIDDLE, line_alpha=0.45, line_dash="dotdash")
+        inside = [(text, line[((line > low) & (line < high)).all(1)][:1]) for text, line in lines]
+        named = [text for text, place in inside if len(place)]
+        at = np.concatenate([np.empty((0, 2)), *(place for _, place in inside)])
+        sheet.text(at[:, 0], at[:, 1], text=named, x_offset=3, y_offset=-2, **TEXT)
     if flat:
         _draw_views(sheet, shown.views)
     _draw_objects(sheet, shown, plane)
@@ -176,14 +183,18 @@ def _draw_objects(sheet: figure, shown: Scene, plane: list[int]) -> None:
         return
     tracks = shown.objects
     sure = np.concatenate([own.existence[1:] for own in tracks])
-    columns: dict[str, Any] = {
+    columns = {
         "name": [own.name for own in tracks for _ in own.time[1:]],
         "time": np.concatenate([own.time[1:] for own in tracks]), "existence": sure, "opacity": 0.2 + 0.7 * sure,
     }  # fmt: skip
     for name, axis in zip("xy", plane, strict=True):
         columns[f"{name}0"] = np.concatenate([own.position[:-1, axis] for own in tracks])
         columns[f"{name}1"] = np.concatenate([own.position[1:, axis] for own in tracks])
-    tint = LinearColorMapper(palette=shades(FAINT, SURE), low=0.0, high=1.0)
+    tint = LinearColorMapper(
+        palette=[to_hex(colour) for colour in LinearSegmentedColormap.from_list("", [FAINT, SURE], 64)(range(64))],
+        low=0.0,
+        high=1.0,
+    )
     band = sheet.segment(
         "x0", "y0", "x1", "y1", source=ColumnDataSource(data=columns), line_width=5, line_alpha="opacity",
         line_color={"field": "existence", "transform": tint},
@@ -196,11 +207,6 @@ def _draw_objects(sheet: figure, shown: Scene, plane: list[int]) -> None:
             major_label_text_color=MIDDLE, title_text_color=MIDDLE, major_tick_line_color=None, bar_line_color=MIDDLE,
         )  # fmt: skip
         sheet.add_layout(_tagged("objects", bar), "right")
-
-
-def shades(first: str, last: str, count: int = 64) -> list[str]:
-    """Colours from one to another, in even steps."""
-    return [to_hex(colour) for colour in LinearSegmentedColormap.from_list("", [first, last], count)(range(count))]
 
 
 def _draw_tracks(sheet: figure, shown: Scene, epochs: ColumnDataSource, plane: list[int]) -> None:
@@ -266,7 +272,7 @@ def _draw_nodes(sheet: figure, shown: Scene, source: ColumnDataSource, plane: li
     if plane == [0, 1] and len(nodes.name) <= NAMED:
         at = nodes.named
         inner = at[:, 0] < shown.low[0] + 0.75 * (shown.high - shown.low)[0]  # names stay on the sheet
-        side: dict[str, Any] = {
+        side = {
             "x_offset": np.where(inner, 8, -8), "text_align": np.where(inner, "left", "right").tolist()
         }  # fmt: skip
         _tagged("names", sheet.text(at[:, 0], at[:, 1], text=nodes.name.tolist(), y_offset=-6, **side, **TEXT))
@@ -291,17 +297,6 @@ def _ring(centre: np.ndarray, covariance: np.ndarray, probability: float) -> np.
 
 
 # Meridians and parallels
-
-
-def _draw_graticule(sheet: figure, frame: LocalFrame, low: np.ndarray, high: np.ndarray, dimension: int) -> None:
-    """Meridians and parallels at round degrees over three times the map, named where they enter it."""
-    lines: list[Any] = list(graticule(frame, low, high, dimension))
-    xs, ys = ([line[:, axis] for _, line in lines] for axis in (0, 1))
-    sheet.multi_line(xs, ys, line_color=MIDDLE, line_alpha=0.45, line_dash="dotdash")
-    inside = [(text, line[((line > low) & (line < high)).all(1)][:1]) for text, line in lines]
-    named = [text for text, place in inside if len(place)]
-    at = np.concatenate([np.empty((0, 2)), *(place for _, place in inside)])
-    sheet.text(at[:, 0], at[:, 1], text=named, x_offset=3, y_offset=-2, **TEXT)
 
 
 def graticule(frame: LocalFrame, low: np.ndarray, high: np.ndarray, dimension: int) -> Iterator[tuple[str, np.ndarray]]:

@@ -43,7 +43,17 @@ def plot_map(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     shown = scene(tree)
     ax.set(xlim=(shown.low[0], shown.high[0]), ylim=(shown.low[1], shown.high[1]))
     keys = _draw_views(ax, shown.views) + _draw_objects(ax, shown.objects)
-    keys += _draw_tracks(ax, shown.tracks) + _draw_mirrored(ax, shown.mirrored, shown.elsewhere)
+    # draw the tracks and the nodes of the other side and return the legend entry
+    for k, track in enumerate(shown.mirrored):
+        places = thinned(track, _most(shown.mirrored)).after[:, :2]
+        ax.plot(*places.T, "--", color=colour(k), linewidth=1.0, alpha=0.7, zorder=2.5)
+    for way in shown.elsewhere:
+        ax.plot(*way[:, :2].T, "--", color="0.3", linewidth=0.8, zorder=4)
+        ax.plot(*way[1, :2], "o", color="0.3", markerfacecolor="none", markersize=7, zorder=5)
+    drawn = shown.mirrored or len(shown.elsewhere)
+    keys += _draw_tracks(ax, shown.tracks) + (
+        [Line2D([], [], color="0.3", linestyle="--", label="fits as well")] if drawn else []
+    )
     keys += _draw_nodes(ax, shown.nodes, probability(tree))
     title = "Map of nodes and tracks" + (" (x-y plane, z not shown)" if shown.dimension > 2 else "")
     return finish(ax, title, grid="", keys=keys, xlabel="x in m", ylabel="y in m")
@@ -79,18 +89,6 @@ def _draw_objects(ax: Axes, objects: list[Found]) -> list[Line2D]:
     bar = ax.inset_axes((1.03, 0.05, 0.02, 0.3))
     figure_of(ax).colorbar(ScalarMappable(Normalize(0.0, 1.0), tint), cax=bar, label="existence")
     return [Line2D([], [], color=SURE, linewidth=4.0, label=f"{len(objects)} objects, by existence")]
-
-
-def _draw_mirrored(ax: Axes, tracks: list[Track], elsewhere: np.ndarray) -> list[Line2D]:
-    """Draw the tracks and the nodes of the other side and return the legend entry."""
-    for k, track in enumerate(tracks):
-        places = thinned(track, _most(tracks)).after[:, :2]
-        ax.plot(*places.T, "--", color=colour(k), linewidth=1.0, alpha=0.7, zorder=2.5)
-    for way in elsewhere:
-        ax.plot(*way[:, :2].T, "--", color="0.3", linewidth=0.8, zorder=4)
-        ax.plot(*way[1, :2], "o", color="0.3", markerfacecolor="none", markersize=7, zorder=5)
-    drawn = tracks or len(elsewhere)
-    return [Line2D([], [], color="0.3", linestyle="--", label="fits as well")] if drawn else []
 
 
 def _draw_tracks(ax: Axes, tracks: list[Track]) -> list[Line2D]:

@@ -107,7 +107,15 @@ def scene(tree: xr.DataTree) -> Scene:
     if not {"calibration", "constant_data"} <= set(tree.children):
         raise InputError("the map needs a result of fit(), with its groups calibration and constant_data")
     nodes, tracks, others = _places(tree), list(_tracks(tree)), alike(tree)
-    mirrored, elsewhere = list(_mirrored(tree, others)), _elsewhere(others, nodes)
+    # where nodes were found and where they stand in answers that fit as well (K, 2, d), if that
+    # is another place
+    d, found = nodes.stated.shape[1], list[np.ndarray]()
+    at = others.get_index("bias_label").get_indexer(pd.Index(_coordinates(nodes.name, d))).reshape(-1, d)
+    for bias, apart in zip(others["bias"].values, others["apart"].values, strict=True):
+        there = np.where(at >= 0, nodes.stated + bias[at], nodes.calibrated)
+        other = np.where(at >= 0, apart[at], 0.0).max(1) > DIFFERENT
+        found.append(np.stack([nodes.calibrated, there], 1)[other])
+    mirrored, elsewhere = list(_mirrored(tree, others)), np.concatenate([np.empty((0, 2, d)), *found])
     attrs = tree["constant_data"].attrs
     frame = LocalFrame(*(float(attrs[name]) for name in GEODETIC)) if GEODETIC[0] in attrs else None
     objects = [Found(name, *rest) for name, *rest in each_object(tree, AXES[: nodes.stated.shape[1]])]
@@ -179,17 +187,6 @@ def _mirrored(tree: xr.DataTree, others: xr.Dataset) -> Iterator[Track]:
             places = group["position"].isel(mode=best).values
             unknown = np.full(places.shape, np.nan)
             yield Track(target, group["time"].values, places, places, unknown, unknown)
-
-
-def _elsewhere(others: xr.Dataset, nodes: Places) -> np.ndarray:
-    """Where nodes were found and where they stand in answers that fit as well (K, 2, d), if that is another place."""
-    d, found = nodes.stated.shape[1], list[np.ndarray]()
-    at = others.get_index("bias_label").get_indexer(pd.Index(_coordinates(nodes.name, d))).reshape(-1, d)
-    for bias, apart in zip(others["bias"].values, others["apart"].values, strict=True):
-        there = np.where(at >= 0, nodes.stated + bias[at], nodes.calibrated)
-        other = np.where(at >= 0, apart[at], 0.0).max(1) > DIFFERENT
-        found.append(np.stack([nodes.calibrated, there], 1)[other])
-    return np.concatenate([np.empty((0, 2, d)), *found])
 
 
 def _views(tree: xr.DataTree, nodes: Places, far: float) -> Iterator[Outline]:

@@ -78,12 +78,15 @@ def _render(tree: xr.DataTree, static: bool) -> str:
     shown, more = words.that_matter(tree)
     pictures = _pictures(tree, light=() if chart is None else ("Map",))
     drawn = pictures.pop(0) if pictures and pictures[0]["title"] == "Map" else None
+    # colour of the verdict: that of the status, a warning where the fit ended well but biases
+    # are in conflict
+    found = COLOURS.get(str(tree.attrs.get("status")), "plain")
     return environment.get_template("page.html").render(
         attrs=attrs,
         title=model or data or "probcal fit",
         source=data if model else "",
         evidence=f"{EVIDENCES[name]} {words.number(attrs[name], 7)}" if (name := evidence_in(attrs)) else "",
-        colour=_colour(tree),
+        colour="warn" if found == "good" and words.in_conflict(tree) else found,
         invalid=attrs["status"] in INVALID,
         headline=words.headline(tree),
         errors=words.position_errors(attrs),
@@ -105,12 +108,6 @@ def _render(tree: xr.DataTree, static: bool) -> str:
         style=(HERE / "style.css").read_text(encoding="utf-8"),
         script=(HERE / "map.js").read_text(encoding="utf-8"),
     )
-
-
-def _colour(tree: xr.DataTree) -> str:
-    """Colour of the verdict: that of the status, a warning where the fit ended well but biases are in conflict."""
-    found = COLOURS.get(str(tree.attrs.get("status")), "plain")
-    return "warn" if found == "good" and words.in_conflict(tree) else found
 
 
 def _versions(attrs: dict[str, Any]) -> str:

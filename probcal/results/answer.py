@@ -177,7 +177,7 @@ class Posterior:
         """Log density (chain, draw, M) of each bias given its precision; None for flat or correlated ones."""
         known = self.prior.proper and not self.prior.correlation and self.summary.covariance.whole
         alpha = self.precisions() if self.precisions is not None else self.summary.precision if known else None
-        return None if alpha is None else log_prior_normal(draws.z, alpha)
+        return None if alpha is None else 0.5 * (np.log(alpha / (2 * np.pi)) - alpha * draws.z**2)
 
     @property
     def sound(self) -> bool:
@@ -199,7 +199,7 @@ class Posterior:
         """
         if self.summary.kind != "mixture" or self.declared is not None:
             return self.summary.evidence
-        prior = self.prior.precision(self.problem.labels, self.problem.surveyed)
+        prior = self.problem.first_precision(self.prior)
         alpha = jax.device_put(self.summary.precision)
         with jax.enable_x64(True):
             at = DenseEngine().at(self.problem.model, self.point)
@@ -257,11 +257,6 @@ def tracks_at(point: Point, variances: Sequence[Any]) -> list[Tracks]:
     """States of each recursion at a point, with their variances (E, n)."""
     sds = [np.sqrt(np.maximum(np.asarray(own), 0.0)) for own in variances]
     return list(map(Tracks, map(np.asarray, point.states), sds))
-
-
-def log_prior_normal(z: np.ndarray, precision: np.ndarray) -> np.ndarray:
-    """Log density of each entry of z, Gaussian around zero with its precision."""
-    return 0.5 * (np.log(precision / (2 * np.pi)) - precision * z**2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -90,7 +90,7 @@ class SensorBlocks(NamedTuple):
         own = group[["block", "block_place", "block_covariance"]].sel(bias_label=list(labels))
         number = np.unique(own["block"].values, return_inverse=True)[1]
         place, M, p = own["block_place"].values, len(labels), group.sizes["place"]
-        members: np.ndarray = np.full((number.max(initial=-1) + 1, p), M)
+        members = np.full((number.max(initial=-1) + 1, p), M)
         members[number, place] = np.arange(M)
         covariance = np.zeros((*members.shape, p))
         covariance[number, place] = own["block_covariance"].values

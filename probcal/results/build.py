@@ -17,7 +17,7 @@ from probcal.lazy import xr
 from probcal.model.motions import level_values
 from probcal.modes.explore import NEAR, SAME
 from probcal.results.accessor import register
-from probcal.results.answer import Answer, Draws, Summary, Tracks
+from probcal.results.answer import Answer, Draws, Tracks
 from probcal.results.groups import (
     along,
     bias_coords,
@@ -104,7 +104,7 @@ def _sample(draws: Draws) -> dict[str, Any]:
 def _posterior_group(answer: Answer, draws: Draws) -> xr.Dataset:
     """Draws of the biases, and of what else varies with them."""
     problem = answer.problem
-    values: dict[str, Any] = {"bias": ((*SAMPLE, "bias_label"), draws.z * problem.scales)}
+    values = {"bias": ((*SAMPLE, "bias_label"), draws.z * problem.scales)}
     further: dict[str, Any] = {}
     for name, (dims, drawn, *own) in answer.posterior.variables.items():
         values[name] = ((*SAMPLE, *dims), drawn)
@@ -164,12 +164,14 @@ def _data_groups(answer: Answer, draws: Draws, before: Point, large: bool) -> di
 
 def _attrs(answer: Answer) -> dict[str, Any]:
     """What was asked for, what ran, and how it ended."""
-    found: Summary = answer.posterior.summary
+    found = answer.posterior.summary
     stated = found.precisions == "given" and answer.prior.hierarchical  # it governs no bias
     intervals = (answer.prior.note if found.kind == "Laplace" else "") or answer.method.note(answer.prior)
     intervals = "Laplace: every bias has a survey, so that no precision is estimated" if stated else intervals
     if found.kind == "Laplace" and answer.problem.model.tailed:
         intervals += "; each epoch's precision of the heavy-tailed process noise is held at its mean"
+    # the date of time 0; nothing where times are no dates
+    date = first_date(answer.problem.measurements.table)
     attrs = {
         "method": answer.method.name, "requested": answer.requested.name,
         "prior": answer.prior.title(answer.problem.biases),
@@ -180,7 +182,7 @@ def _attrs(answer: Answer) -> dict[str, Any]:
         "assessed": 0,
         "status": str(answer.status), "message": answer.message, "data": answer.problem.measurements.table.source,
         "versions": json.dumps({name: version(name) for name in ("probcal", "jax", "arviz", "numpy", "xarray")}),
-        **answer.posterior.attrs, **_epoch(answer.problem), **_origin(answer.problem),
+        **answer.posterior.attrs, **_epoch(answer.problem), **({"time_origin": date} if date else {}),
         **({"places": "integrated"} if answer.problem.tilted else {}),
     }  # fmt: skip
     if found.evidence is not None:
@@ -221,12 +223,6 @@ def build_tracks(problem: Problem, tracks: Sequence[Tracks], before: Sequence[An
 def _epoch(problem: Problem) -> dict[str, float]:
     """Length of common epochs in s and the largest shift of a row to one; nothing where rows keep their times."""
     return {} if problem.epoch is None else {"epoch": problem.epoch, "epoch_shift": problem.epoch_shift}
-
-
-def _origin(problem: Problem) -> dict[str, str]:
-    """The date of time 0; nothing where times are no dates."""
-    date = first_date(problem.measurements.table)
-    return {"time_origin": date} if date else {}
 
 
 def modes_of(answer: Answer) -> tuple[list[ModeRow], list[Sequence[Any]]]:

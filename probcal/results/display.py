@@ -16,7 +16,7 @@ SHOWN = ("bias", "unit", "mean", "sd", "lower", "upper", "gamma", "status", "ver
 def install() -> None:
     """Have IPython, where it runs, show results this way."""
     found = sys.modules.get("IPython")
-    shell: Any = found.get_ipython() if found is not None and hasattr(found, "get_ipython") else None
+    shell = found.get_ipython() if found is not None and hasattr(found, "get_ipython") else None
     if shell is None:
         return
     formatters = shell.display_formatter.formatters

@@ -60,6 +60,11 @@ def datum_of(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
     return {"coords": coords, "y": np.concatenate([c[2] for c in columns])}, picks
 
 
+def data_columns(datum: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """What `datum_of` says of every datum, a column by name."""
+    return {name: values for name, (_, values) in datum["coords"].items()}
+
+
 def gather(parts: Sequence[np.ndarray], picks: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     """Measured data of all blocks, last axis datum, from arrays (..., N, C)."""
     found = [np.asarray(p)[..., rows, channels] for p, (rows, channels) in zip(parts, picks, strict=True)]
@@ -141,7 +146,7 @@ def by_target(
                 key: (dims, np.take(np.asarray(parts[r]), mine, dims.index("time")))
                 for key, (dims, parts) in variables.items()
             }
-            own: dict[str, Any] = {"time": times[mine], **(coords or {})}
+            own = {"time": times[mine], **(coords or {})}
             if any("component" in dims for dims, _ in variables.values()):
                 own["component"] = list(epochs.components)
             found[node_of(name)] = xr.Dataset(values, coords=own, attrs={"target": name})
@@ -163,7 +168,7 @@ def constant_group(problem: Problem, point: Point | None = None) -> xr.Dataset:
         "moving": ("node", np.array([n.path is not None for n in nodes])),
         "stated": ("value", np.array(numbers)),
     }
-    coords: dict[str, Any] = {
+    coords = {
         "node": [n.name for n in nodes], "axis": list(AXES[:d]),
         "stated_node": ("value", np.array(owners)), "stated_component": ("value", np.array(components)),
         "placed_sensor": ("placement", np.array([s.name for s, _ in placed])),

@@ -48,15 +48,8 @@ def save(tree: xr.DataTree, path: str | PathLike[str]) -> Path:
     ...     load(path).attrs["status"]
     'converged'
     """
-    content = tree.to_netcdf(engine="h5netcdf", encoding=_encoding(tree))  # in memory: HDF5 dies on a full disk
-    return write_whole(path, b"".join([content, SEAL, hashlib.sha256(content).digest()]))
-
-
-def _encoding(tree: xr.DataTree) -> dict[str, Any]:
-    """Compression and a checksum for every array of every group; texts as characters, which alone can have them.
-
-    Small ones stay plain, an HDF5 chunk would cost more than it holds: the digest of the whole file covers them.
-    """
+    # every array compressed, with a checksum; texts as characters, which alone can have them;
+    # small ones plain, as an HDF5 chunk costs more: the digest of the whole file covers them
     packed = {"zlib": True, "complevel": 4, "shuffle": True, "fletcher32": True}
     found: dict[str, Any] = {}
     for node in tree.subtree:
@@ -66,7 +59,8 @@ def _encoding(tree: xr.DataTree) -> dict[str, Any]:
             for name, variable in variables
             if variable.nbytes > SMALL
         }
-    return found
+    content = tree.to_netcdf(engine="h5netcdf", encoding=found)  # in memory: HDF5 dies on a full disk
+    return write_whole(path, b"".join([content, SEAL, hashlib.sha256(content).digest()]))
 
 
 def _is_text(variable: xr.Variable) -> bool:

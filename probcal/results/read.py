@@ -103,7 +103,7 @@ def tracks(tree: xr.DataTree) -> pd.DataFrame:
     """
     parts = []
     for target, group in each_target(tree):
-        columns: dict[str, np.ndarray] = {"time": group["time"].values, "target": np.full(group.sizes["time"], target)}
+        columns = {"time": group["time"].values, "target": np.full(group.sizes["time"], target)}
         for component in group["component"].values:
             columns[str(component)] = group["mean"].sel(component=component).values
             columns[f"{component}_sd"] = group["sd"].sel(component=component).values

@@ -10,7 +10,6 @@ import numpy as np
 from probcal.errors import checked
 from probcal.labels import NOBODY, coordinates
 from probcal.lazy import xr
-from probcal.results.alignment import Alignment
 from probcal.results.alignment import align as laid_on
 from probcal.results.read import each_target, frame_of
 
@@ -94,7 +93,15 @@ def add_scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> 
     8.0
     """
     found = scores(tree, truth, align=align)
-    _forget(tree)
+    # take out what another truth said, or this one otherwise aligned
+    for name in [str(name) for name in tree.attrs]:
+        if name.startswith("position_rmse_") or name in ("bias_rmse", "coverage"):
+            del tree.attrs[name]
+    if "truth" in tree.children:
+        del tree["truth"]
+    for node in tree["track"].children.values() if "track" in tree.children else ():
+        if "true" in node.data_vars:
+            node.dataset = node.to_dataset(inherit=False).drop_vars("true")
     tree.attrs.update(found)
     labels = tree["calibration"].to_dataset()["bias_label"].values if "calibration" in tree.children else ()
     known = {label: float(value) for label, value in truth.biases.items() if label in labels}
@@ -105,7 +112,7 @@ def add_scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> 
     if "track" not in tree.children:
         return tree
     _, after, true = _met(tree, truth)
-    frame: Alignment | None = None if align is None or not len(true) else laid_on(after, true, align)
+    frame = None if align is None or not len(true) else laid_on(after, true, align)
     for node in tree["track"].children.values() if len(true) else ():
         track = node.to_dataset(inherit=False)
         if node.attrs["target"] == NOBODY:
@@ -116,15 +123,3 @@ def add_scores(tree: xr.DataTree, truth: Truth, *, align: str | None = None) -> 
         columns[:, located] = places if frame is None else frame.back(places)
         node["true"] = xr.DataArray(columns, dims=("time", "component"))
     return tree
-
-
-def _forget(tree: xr.DataTree) -> None:
-    """Take out what another truth said, or this one otherwise aligned."""
-    for name in [str(name) for name in tree.attrs]:
-        if name.startswith("position_rmse_") or name in ("bias_rmse", "coverage"):
-            del tree.attrs[name]
-    if "truth" in tree.children:
-        del tree["truth"]
-    for node in tree["track"].children.values() if "track" in tree.children else ():
-        if "true" in node.data_vars:
-            node.dataset = node.to_dataset(inherit=False).drop_vars("true")

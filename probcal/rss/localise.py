@@ -12,12 +12,12 @@ from scipy.special import log_ndtr, logsumexp
 
 from probcal.errors import InputError, nearest
 from probcal.linalg import least_squares, singular, spectrum
+from probcal.sensors import CLOSE
 
 CRITERIA = ("snls", "predicted", "residual", "virtual", "gml", "huber", "student", "nls")
 """How residuals at a place are weighed: `snls` equally (the profile likelihood, and the default); by their variance
 `predicted` sigma^2 (1 + h), `residual` sigma^2 (1 - h), or `virtual` as printed in (8), sigma^2 h; `gml` with unknown
 noise (14); `huber` and `student` (4 degrees of freedom) for outliers; `nls` with the exponent known."""
-CLOSE = 1e-3  # m, distance below which a level no longer changes
 HUBER = 1.345  # stds beyond which a residual counts linearly
 FREEDOM = 4.0  # of the Student-t
 REWEIGHED = 8  # rounds of reweighting of a robust criterion

@@ -11,11 +11,11 @@ from probcal.labels import AXES
 from probcal.lazy import xr
 from probcal.linalg import singular
 from probcal.problem import Problem
+from probcal.sensors import CLOSE
 from probcal.simulate import Truth
 
 MODELS = ("M0", "M1", "M2")
 POWERS = ("target", "time")
-CLOSE = 1e-3  # m, distance below which a level no longer changes
 FEWEST = 20  # residuals of which a test makes sense
 
 

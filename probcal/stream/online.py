@@ -327,7 +327,7 @@ class Online:
         """Each bias as all rows so far have it, those in the window too: label, unit, mean, sd, interval, gamma."""
         problem, end = self._problem, self.end
         z, root = np.asarray(end.mean), np.asarray(end.root)
-        before = np.sqrt(np.diag(invert(np.asarray(self.prior.precision(problem.labels, problem.surveyed).matrix()))))
+        before = np.sqrt(np.diag(invert(np.asarray(problem.first_precision(self.prior).matrix()))))
         sd = np.sqrt((root**2).sum(1))
         sd = sd * widening_factors(sd, before, self.inflation)
         scales = problem.scales
@@ -378,7 +378,7 @@ class Online:
                 " no prior that could be replaced; fit the rows as a batch"
             )
         problem = self._problem
-        precision = self.prior.precision(problem.labels, problem.surveyed)
+        precision = problem.first_precision(self.prior)
         chosen = as_prior(prior, Horseshoe(), problem.network.labels)
         moments = relearnt(problem, chosen, precision, np.asarray(self.end.mean), np.asarray(self.end.root), key)
         scales, sd = problem.scales, np.sqrt(np.diag(moments.covariance))
@@ -498,7 +498,7 @@ class Online:
         if self.calibration is not None:
             known = apply(problem, self.calibration)
             return jax.device_put(known.z), jax.device_put(cholesky(_positive(known.covariance)))
-        matrix = np.asarray(self.prior.precision(problem.labels, problem.surveyed).matrix())
+        matrix = np.asarray(problem.first_precision(self.prior).matrix())
         root = cholesky(_positive(invert(matrix)))
         return jnp.zeros(problem.model.biases), jax.device_put(root)
 

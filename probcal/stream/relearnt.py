@@ -28,7 +28,7 @@ def relearnt(problem: Problem, prior: Prior, held: Precision, mean: np.ndarray, 
     inverse = invert(root)
     whole = inverse.T @ inverse
     information, pull = whole - np.asarray(held.matrix()), whole @ mean
-    first = prior.precision(problem.labels, problem.surveyed)
+    first = problem.first_precision(prior)
     if isinstance(prior, ARD) and prior.rate == 0.0:
         return _maximised(problem, prior, first, information, pull)
     if not prior.hierarchical or isinstance(prior, Gaussian):

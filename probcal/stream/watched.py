@@ -104,7 +104,7 @@ def calibration_tree(online: FilteredStream) -> xr.DataTree:
     else:
         point = track_mode(problem, automatic_start(problem)._replace(z=jnp.asarray(z), levels=levels))
     covariance = root @ root.T
-    before = np.asarray(online.prior.precision(problem.labels, problem.surveyed).matrix())
+    before = np.asarray(problem.first_precision(online.prior).matrix())
     known: dict[str, Any] = {}
     if sampled:  # the tracks that particles had of the last rows, whatever the motion
         known = {"moments": tracks, "zero": point._replace(z=jnp.zeros_like(point.z)), "draw": draw_filtered}

@@ -161,7 +161,7 @@ class _Engine:
         self.problem, self.method, self.prior, self.source = problem, method, prior, source
         self.start, self.draws, self.key = start, draws, key
         self.other = replace(NUTS(), warmup=SHORT["warmup"]) if fallback else None
-        self.first = source.precision(problem.labels, problem.surveyed)
+        self.first = problem.first_precision(source)
         self.around = "data" if isinstance(around, str) else "fit" if around is not None else ""
         self.pool: Pool | None = None
         if around is not None and problem.clocks.any():

@@ -23,7 +23,7 @@ from probcal.inference.loop import Trace
 from probcal.inference.method import Context, Given, Method, State
 from probcal.inference.methods import METHODS, NUTS, check_problem, choose_prior
 from probcal.inference.progress import Monitor, OnProgress
-from probcal.inference.run import Maximiser, check_method, first_precision, first_state, given_of, kernel, stepped
+from probcal.inference.run import Maximiser, check_method, first_state, given_of, kernel, stepped
 from probcal.inference.solve import solve
 from probcal.inference.spread import check_scheduler, spread
 from probcal.inference.storage import Storage
@@ -162,7 +162,7 @@ def _batch(
                     state, mixed, count = solved[j]
                     problem = chosen[j].problem.with_mixing(state.mixing)
                     if how is not None and inside is None:
-                        held = first_precision(problem, prior)
+                        held = problem.first_precision(prior)
                         mixed = integrate(how, problem.model, held, state.point, jax.random.key(SEED))
                     course = Trace(*np.full((3, int(count)), np.nan))  # of a batch, which keeps none
                     answer = conclude(problem, method, prior, state, course, how, mixed)

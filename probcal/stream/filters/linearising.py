@@ -11,11 +11,9 @@ from probcal.model import rows as waist
 from probcal.model.epochs import Epoch
 from probcal.model.model import Model
 from probcal.model.rows import Block, Linearised, Rows
-from probcal.model.sigma import Rule
+from probcal.model.sigma import FLOOR, Rule
 from probcal.noise import gate_limits
 from probcal.stream.filters.belief import Augmented, Slots, WhiteRow
-
-FLOOR = 1e-10  # least variance along an axis of the sigma points
 
 
 class About(NamedTuple):

@@ -169,7 +169,7 @@ def scene_of(problem: Problem, prior: Prior, objects: float, z: np.ndarray) -> t
     epoch = np.minimum(np.searchsorted(time, scans.time), len(time) - 1)
     first = first_of(watch, views, cloud, jax.device_put(z))
     place = places(numbers, own.row_index)
-    precision = prior.precision(problem.labels, problem.surveyed)
+    precision = problem.first_precision(prior)
     put = jax.device_put
     scene = Recording(watch, put(epoch), put(place), first, put(z), put(precision), put(float(objects)))
     there = np.isin(numbers, np.flatnonzero(scans.detected))
