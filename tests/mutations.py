@@ -39,7 +39,7 @@ MUTATIONS = [
     # analysis/slopes.py, analysis/recoded.py
     Mutation("if not gain > CONFIRMED * expected:", "if not gain > 1e9:", "test_slopes.py"),
     Mutation("(inverse[k] - np.diag(held[members]))[np.ix_", "inverse[k][np.ix_", "test_slopes.py"),
-    Mutation("changes = [] if slopes.ratio > first else changes", "pass", "test_slopes.py"),
+    Mutation("if slopes.findings and strength > CLEARLY * ratio:", "if False:", "test_slopes.py"),
     Mutation('f"look like {other}": lambda value: quarter - value,', "", "test_slopes.py"),
     # gaussian/selected.py
     Mutation("across.T, inner - down.T @ across", "across.T, inner", "test_sparse.py"),

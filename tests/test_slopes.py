@@ -114,6 +114,7 @@ def test_every_shape_is_tried_where_it_can_be(looked):
     assert {shape.name for shape in looked("plane").shapes} == set(SAID) - {"elevation"}
 
 
+@pytest.mark.ci
 def test_a_deviation_curve_is_named_and_what_is_advised_mends_it():
     curve = [(0.16, 0.10), (0.0, 0.0), (0.0, 0.0), (-0.10, 0.15)]
     table = drawn(0, curve)
@@ -125,7 +126,7 @@ def test_a_deviation_curve_is_named_and_what_is_advised_mends_it():
         assert not said(tree, silent), silent
     assert set(tree["verdict"]["verdict"].values.tolist()) >= {"weak"}
     formula, unit, size = re.search(
-        r'add (.*) to finder, a = probcal.geometry.bearing\(.*\), .* north=Bias\("(.*)", (.*)\)', text
+        r'add (.*) to azimuth of finder, a = probcal.geometry.bearing\(.*\), .* north=Bias\("(.*)", (.*)\)', text
     ).groups()
     kind = finder(formula, east=Bias(unit, float(size)), north=Bias(unit, float(size)))
     problem, tree = checked(table, kind)
@@ -146,6 +147,15 @@ def test_a_deviation_curve_is_named_without_matrices_of_all_biases():
     assert {"d0.azimuth", "d3.azimuth"} == {name.strip() for name in text.partition(":")[0].split(",")}
 
 
+@pytest.mark.ci
+def test_a_heading_that_jumps_is_drifting_and_not_silenced_by_a_shape():
+    table = drawn(3)
+    table.loc[(table["sensor"] == "d1") & (table["time"] >= 300), "azimuth"] += 0.06
+    _, tree = checked(table)
+    assert [text.partition(":")[0] for text in said(tree, "drifting")][:1] == ["d1.heading"]
+
+
+@pytest.mark.ci
 def test_a_sound_network_has_no_slope():
     _, tree = checked(drawn(1))
     assert said(tree, "slope") == said(tree, "recoded") == []

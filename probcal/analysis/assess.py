@@ -60,6 +60,7 @@ def _assessed(case: Case) -> xr.DataTree:
     groups = {name: group for own in found.values() for name, group in own.groups.items()}
     groups["verdict"] = verdict = _verdicts(case, list(found.values()))
     signs = {name for own in found.values() for name in own.explains}
+    signs = {name for own in found.keys() - signs for name in found[own].explains}  # what is a sign explains nothing
     findings = [one for name, own in found.items() if name not in signs for one in own.findings] + alarms(verdict)
     if "answer" not in case.has:  # likely causes; the message of a misfit has its own
         cause = "other" if "explained" in case.has else "misfit"

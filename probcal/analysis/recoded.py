@@ -6,20 +6,23 @@ convention counts them, and the joint mode is looked for again.
 
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 
 import numpy as np
 
 from probcal.analysis.check import Case, Checked, check
 from probcal.analysis.findings import Finding
 from probcal.analysis.parts import LOOKED
+from probcal.errors import InputError
 from probcal.gaussian.engine import Expansion
 from probcal.inference.fitted import Judged
 from probcal.inference.residuals import PRACTICAL
+from probcal.misfit import STANDS_OUT
 from probcal.model.rows import standardised
 from probcal.modes import optima
+from probcal.problem import Problem
 from probcal.sensor import Channel
 
-FAR = 5.0  # mean square of the innovations from which readings are looked at
 LONGEST = 20.0  # s after which no other way is tried
 # what else speaks of it
 SIGNS = ("levels", "process", "channels", "sensors", "rows", "slopes", "shape", "segments")
@@ -41,26 +44,32 @@ def ways(channel: Channel, signed: bool) -> Mapping[str, Way]:
 
 @check(causes=["misfit", "other"])
 def check_recoded(case: Case) -> Checked:
-    """A finding on the sensor, or the type, whose readings another convention explains where the fit does not."""
+    """A finding on the sensor, or the type, whose readings another convention explains and no answer as they are."""
     linear = all(form is None for form in case.fit.problem.model.sampled)
-    if not (case.fit.engine.cheap and linear) or case.innovations.spread(slice(None)) < FAR:
+    if not (case.fit.engine.cheap and linear and case.innovations.spread(slice(None)) >= STANDS_OUT):
         return Checked()
-    begun = time.monotonic()
-    for name, said, values in _tried(case):
-        if time.monotonic() - begun > LONGEST:
-            break
-        again = case.fit.problem.redrawn(values)
-        square = _square(case.fit, case.fit.engine.at(again.model, optima(again, lambda: True)[0].point))
-        if square < PRACTICAL:
-            text = (
-                f"{name}: its values {said}: counted so, the mean square of what a fit"
-                f" leaves is {square:.2g} and not {_square(case.fit, case.fit.expansion):.2g}"
-            )
-            return Checked(findings=[Finding("recoded", name, text)], explains=SIGNS)
+    with suppress(MemoryError, np.linalg.LinAlgError, InputError):
+        begun, stated = time.monotonic(), min(_square(case.fit.expansion, case.fit), _left(case.fit, case.fit.problem))
+        for name, said, values in _tried(case) if stated >= STANDS_OUT else ():
+            if time.monotonic() - begun > LONGEST:
+                break
+            square = _left(case.fit, case.fit.problem.redrawn(values))
+            if square < PRACTICAL:
+                text = (
+                    f"{name}: its values {said}: counted so, the mean square of what a fit leaves is {square:.2g} and"
+                    f" not {stated:.2g}"
+                )
+                return Checked(findings=[Finding("recoded", name, text)], explains=SIGNS)
     return Checked()
 
 
-def _square(fit: Judged, at: Expansion) -> float:
+def _left(fit: Judged, problem: Problem) -> float:
+    """Mean square of the standardised residuals at the first joint mode of a problem, at the levels of the fit."""
+    point = optima(problem, lambda: True)[0].point._replace(levels=fit.point.levels)
+    return _square(fit.engine.at(problem.model, point), fit)
+
+
+def _square(at: Expansion, fit: Judged) -> float:
     """Mean square of the standardised residuals at a point."""
     return float(np.mean(fit.flat([standardised(lin.score, lin.weight) for lin in at.rows]) ** 2))
 
@@ -79,6 +88,8 @@ def _tried(case: Case) -> Iterator[tuple[str, str, list[np.ndarray]]]:
         }
         for c, (channel, declared) in enumerate(kind.expand(problem.network.dimension)):
             own = [np.asarray(rows.y)[:, c] for block, rows, _ in problem.model.each_block() if block.type == kind]
+            if not any(values.any() for values in own):
+                continue
             signed = {-1.0, 1.0} <= {*np.sign(np.concatenate([np.zeros(1), *own])).tolist()}
             for said, way in ways(declared, signed).items():
                 for name, sensors in groups.items():

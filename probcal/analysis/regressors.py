@@ -1,4 +1,4 @@
-"""Columns of data that the predictions of a channel may follow beyond its model, by the geometry at a fit."""
+"""Columns that predictions may follow beyond their model, by the geometry at a fit."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,33 +14,35 @@ MOVING = ("position", "velocity", "acceleration")  # components of which others 
 UNCENTRED = ("time", "reading")  # columns of which a multiple is a cause of its own
 
 
-def regressors(fit: Judged, group: np.ndarray, kinds: Sequence[tuple[Any, Any]]) -> dict[str, np.ndarray]:
+def regressors(
+    fit: Judged, group: np.ndarray, kinds: Sequence[tuple[Any, Any]], still: Sequence[bool], after: np.ndarray
+) -> dict[str, np.ndarray]:
     """Columns (D, k) by name, of data whose channel is `group` (D,) of these `kinds`, type and declaration.
 
+    `still` says which have nodes that do not move, `after` (D,) is what the fit leaves.
     The constant part of a channel is taken out, but of `UNCENTRED`; zero where a channel does not have a column, or has
     too few data.
     """
     line, count = lines(fit), np.bincount(group)
     flat, far = np.hypot(line[:, 0], line[:, 1])[:, None], np.linalg.norm(line, axis=1)[:, None] / farthest(fit)
-    weight, score, value = (
-        fit.flat(own)[:, None]
-        for own in ([lin.weight for lin in fit.lins], [lin.score for lin in fit.lins], fit.problem.model.values)
-    )
+    value = fit.flat(fit.problem.model.values)
     found = {
         "time": rates(fit)[:, None], "direction": line[:, :2] / np.maximum(flat, 1e-9),
         "distance": np.hstack([far, far**2]), "elevation": np.arctan2(line[:, 2:], flat),
-        "reading": value - score / np.maximum(weight, 1e-300),
+        "reading": (value - after)[:, None],
     }  # fmt: skip
     few = np.array([channel.noise == Bernoulli() for _, channel in kinds]) | (count < FEWEST)
-    for name, own in found.items():
+    for name, columns in found.items():
         if name not in UNCENTRED:
-            means = np.reshape([np.bincount(group, column) for column in own.T], (-1, len(count))) / count
-            own = own - means.T[group]
-        has = [
-            (kind.reads_target and (name == "time" or kind.arity == 1)) if name != "reading" else not channel.wrap
-            for kind, channel in kinds
-        ]
-        found[name] = np.where((np.array(has) & ~few)[group, None], own, 0.0)
+            means = np.reshape([np.bincount(group, own) for own in columns.T], (-1, len(count))) / count
+            columns = columns - means.T[group]
+        if name == "reading":
+            has = [not channel.wrap for _, channel in kinds]
+        elif name == "time":
+            has = [own.reads_target and rests for (own, _), rests in zip(kinds, still, strict=True)]
+        else:
+            has = [kind.reads_target and kind.arity == 1 for kind, _ in kinds]
+        found[name] = np.where((np.array(has) & ~few)[group, None], columns, 0.0)
     return found
 
 
@@ -55,7 +57,7 @@ def lines(fit: Judged) -> np.ndarray:
 
 def farthest(fit: Judged) -> float:
     """The largest distance of a target from a node that sees it."""
-    return max(float(np.linalg.norm(lines(fit), axis=1).max()), 1e-9)
+    return float(f"{max(np.linalg.norm(lines(fit), axis=1).max(), 1e-9):.3g}")  # as it is said
 
 
 def rates(fit: Judged) -> np.ndarray:
@@ -66,7 +68,8 @@ def rates(fit: Judged) -> np.ndarray:
         own = [name.rpartition("_")[0] in MOVING for name in epochs.components]
         for mine in epochs.members.values():
             some = np.ix_(np.flatnonzero(mine), own)
-            rate[some] = slopes(epochs.time[mine], np.asarray(states)[some])
+            time, first, back = np.unique(epochs.time[mine].round(6), return_index=True, return_inverse=True)
+            rate[some] = slopes(time, np.asarray(states)[some][first])[back]
         moving.append(rate)
     parts = fit.problem.model.each_block(fit.lins)
     return fit.flat(

@@ -20,7 +20,7 @@ from probcal.analysis import levels, pieces
 from probcal.analysis.check import Case, Checked, check
 from probcal.analysis.findings import Finding
 from probcal.analysis.pieces import HELD, SUSPECT, TOGETHER, Change, Contrast, Grid, Patterns, Pieces, grid_for
-from probcal.analysis.slopes import found_slopes
+from probcal.analysis.slopes import told_slopes
 from probcal.analysis.verdict import RATE, limit_of
 from probcal.gaussian.engine import Factors, Group, told_alone
 from probcal.inference import residuals
@@ -29,6 +29,8 @@ from probcal.labels import listed
 from probcal.linalg import invert
 from probcal.problem import Problem
 from probcal.results.groups import along, bias_coords
+
+CLEARLY = 2.0  # times as large a chi-square, over limits, from which one of two causes is said alone
 
 
 class Compared(NamedTuple):
@@ -53,10 +55,8 @@ def check_segments(case: Case) -> Checked:
     if compared is None:
         return Checked()
     problem, inflation, changes = case.fit.problem, compared.inflation, compared.changes
-    M, slopes = problem.model.biases, case.once(found_slopes)
-    if changes and slopes is not None:  # the stronger counts
-        first = changes[0].square / limit_of(M, changes[0].contrast.freedom)
-        changes = [] if slopes.ratio > first else changes
+    M = problem.model.biases
+    changes, explains = _weighed(case, changes)
     limit, groups, findings = limit_of(M), {}, []
     if compared.alone:
         groups["halves"] = group_of(problem, compared, grid)
@@ -82,7 +82,17 @@ def check_segments(case: Case) -> Checked:
         text = "more biases may have changed and were not compared: so many are rarely drifts of single biases"
         findings.append(Finding("halves", "fit", f"{compared.unsolved} {text}"))
     doubts = {"drifting": drifts, "conflicting": disagreements, "weak": weak}
-    return Checked(groups, findings, doubts, ["levels", "slopes"] if changes else [], inflation, remarks)
+    return Checked(groups, findings, doubts, explains, inflation, remarks)
+
+
+def _weighed(case: Case, changes: list[Change]) -> tuple[list[Change], list[str]]:
+    """The changes, none where shapes of the residuals are clearly stronger, and the checks that they explain."""
+    slopes, strength = case.once(told_slopes)
+    first = changes[0] if changes else None
+    ratio = first.square / limit_of(case.fit.problem.model.biases, first.contrast.freedom) if first else 0.0
+    if slopes.findings and strength > CLEARLY * ratio:
+        return [], []
+    return changes, ["levels", "slopes"][: 1 + bool(ratio > CLEARLY * strength)] if changes else []
 
 
 def compare_segments(

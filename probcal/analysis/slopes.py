@@ -1,8 +1,8 @@
-"""Does what a fit leaves of the data follow the geometry: direction, distance, elevation, the reading, its rate?
+"""Do residuals follow the geometry: direction, distance, elevation, the reading, its rate?
 
-Every channel of a sensor gets coefficients of such shapes beside the biases, all zero, and all trajectories are
-eliminated together at the fit: a score test of each shape, all else following. The strongest is let free, the others
-are judged anew beside it, and what is found is confirmed by tracks settled on the data without it.
+Every channel of a sensor gets coefficients of such shapes, all zero, and all trajectories are eliminated together
+at the fit: a score test of each shape, all else following. The strongest is let free, the others are judged anew, and
+what is found is confirmed by tracks settled on the data without it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from probcal.analysis import levels, pieces
 from probcal.analysis.check import Case, Checked, check
 from probcal.analysis.findings import Finding
-from probcal.analysis.pieces import HELD, SUSPECT, TOGETHER, Contrast, grid_for
+from probcal.analysis.pieces import COPIES, HELD, SUSPECT, TOGETHER, Contrast, grid_for
 from probcal.analysis.regressors import farthest, regressors
 from probcal.analysis.verdict import limit_of
 from probcal.gaussian.engine import Expansion, Factors, told_alone
@@ -44,7 +44,7 @@ SAID = {  # what the residuals of a channel follow
 
 
 class Shape(NamedTuple):
-    """A part that predictions of some channels have too much: its name, and their numbers among the innovations."""
+    """A part that predictions of some channels have too much, by their numbers."""
 
     name: str
     channels: tuple[int, ...]
@@ -52,18 +52,19 @@ class Shape(NamedTuple):
 
 @check("explained", "factor")
 def check_slopes(case: Case) -> Checked:
-    """Channels whose residuals follow the geometry, and biases that move by more than `levels.HANGS` sd without it."""
-    found = case.once(found_slopes)
-    return Checked() if found is None else _said(found)
+    """Channels whose residuals follow the geometry, and biases that would move without it."""
+    return case.once(told_slopes)[0]
 
 
-def found_slopes(case: Case) -> Slopes | None:
-    """The shapes that the data have too much, if tracks settled on the data without them confirm it."""
+def told_slopes(case: Case) -> tuple[Checked, float]:
+    """The findings, if tracks settled on the data without the shapes confirm them; and the chi-square of the strongest
+    over its limit."""
     with suppress(MemoryError, np.linalg.LinAlgError):
         found = _Looked(case).found()
         if found is not None and found.without is not None:
-            return found
-    return None
+            sd, limit = next(iter(found.free.values()))
+            return _said(found), (sd / limit) ** 2
+    return Checked(), 0.0
 
 
 class _Wider(NamedTuple):
@@ -97,11 +98,14 @@ class _Looked:
     @cached_property
     def columns(self) -> dict[str, np.ndarray]:
         """Columns (D, k) of each shape."""
-        return regressors(self.fit, self.case.channels.group, [own[1:] for own in self.kinds])
+        placed = self.fit.problem.network.sensors
+        still = [all(node.path is None for node in placed[s].nodes) for s, *_ in self.kinds]
+        after = self.case.tree["residual"].to_dataset()["after"].values
+        return regressors(self.fit, self.case.channels.group, [own[1:] for own in self.kinds], still, after)
 
     @cached_property
     def shapes(self) -> dict[Shape, bool]:
-        """The shapes of every channel, and of all of a type (True); of times of every sensor, and of a type."""
+        """The shapes of every channel (times: sensor), and of all of a type (True)."""
         found, channel = dict[Shape, bool](), self.case.channels.labels["channel"]
         for name, values in self.columns.items():
             told = np.bincount(self.case.channels.group, np.abs(values).sum(1)) > 1e-9
@@ -113,6 +117,17 @@ class _Looked:
                 found |= {Shape(name, tuple(members)): shared for members in own.values()}
         return found
 
+    def slots(self, shapes: list[Shape]) -> tuple[list[int], int]:
+        """The first slot of each shape in the rows of its sensors, and the columns needed."""
+        model, used = self.fit.problem.model, np.zeros(len(self.fit.problem.network.sensors), int)
+        first, sizes = list[int](), [self.columns[shape.name].shape[1] for shape in shapes]
+        for shape, size in zip(shapes, sizes, strict=True):
+            own = [self.kinds[c][0] for c in shape.channels]
+            first.append(int(used[own].max()))
+            used[own] = first[-1] + size
+        fewest = min((data.bias.shape[1] for data in model.rows if data.bias.shape[1]), default=1)
+        return first, max(-(-sum(sizes) // model.biases), -(-int(used.max()) // fewest))
+
     def widened(self, shapes: list[Shape]) -> _Wider:
         """The expansion with the coefficients of some shapes.
 
@@ -123,14 +138,8 @@ class _Looked:
         owner = [np.zeros(len(data.bias), int) for data in model.rows]
         for _, data, _, place, index in model.each_block(owner, problem.row_index):
             place[np.asarray(data.sensor)] = problem.measurements.sensor[index]
-        used, first, most = np.zeros(len(problem.network.sensors), int), list[int](), 0
-        for shape in shapes:
-            own, size = sensor[list(shape.channels)], self.columns[shape.name].shape[1]
-            first.append(int(used[own].max()))
-            used[own], most = first[-1] + size, most + size
+        first, q = self.slots(shapes)
         along = grid_for(self.fit).along + 1.0
-        fewest = max(min(data.bias.shape[1] for data in model.rows), 1)
-        q = max(-(-most // model.biases), -(-int(used.max()) // fewest))
         along = along if along.shape[1] >= q else np.ones((len(along), q))
         none, widths = model.biases * (1 + along.shape[1]), [along.shape[1] * d.bias.shape[1] for d in model.rows]
         tables = [np.full((len(place), width), none) for place, width in zip(owner, widths, strict=True)]
@@ -166,7 +175,7 @@ class _Looked:
         return factors, held, np.append(np.asarray(wider.at.solve(factors, pull)), 0.0)
 
     def tests(self, wider: _Wider, free: Sequence[int] = ()) -> dict[int, Contrast]:
-        """Each shape by itself, those in `free` beside it, by its number; coefficients in sd of what is told alone."""
+        """Each shape by itself, those in `free` free too, by its number; in sd of what is told alone."""
         factors, held, step = self.mean(wider, free, 1.0)
         inverse, found = invert(np.asarray(wider.at.marginals(factors, wider.members))), dict[int, Contrast]()
         score = np.einsum("bij,bj->bi", inverse, step[wider.members])
@@ -199,7 +208,7 @@ class _Looked:
         return np.maximum(each, np.mean(each[case.channels.group]))
 
     def found(self) -> Slopes | None:
-        """The shapes that the data have too much, the strongest first: all are looked at, then suspects together."""
+        """The shapes that the data have too much: all are looked at, then suspects together."""
         wide, count = np.full(len(self.kinds), np.inf), len(self.shapes)
         over, parts = dict[Shape, Contrast](), dict[tuple[str, bool], list[Shape]]()
         for shape, shared in self.shapes.items():
@@ -217,6 +226,9 @@ class _Looked:
         order = [shape for shape in order if ratio(shape, over[shape]) > SUSPECT][: TOGETHER // 2]
         if not order or ratio(order[0], over[order[0]]) <= 1.0:
             return None
+        M = self.fit.problem.model.biases
+        while self.fit.engine.cheap and len(order) > 1 and (1 + self.slots(order)[1]) * M > COPIES:
+            order = order[: len(order) // 2]
         wider, free = self.widened(order), dict[int, tuple[float, float]]()
         while len(free) < len(order) and (tested := self.tests(wider, list(free))):
             np.minimum(wide, self.wide(wider, tested), out=wide)
@@ -236,12 +248,6 @@ class Slopes:
     wider: _Wider
     free: dict[int, tuple[float, float]]  # which of the shapes, the strongest first, and how many sd, and their limit
 
-    @property
-    def ratio(self) -> float:
-        """The chi-square of the strongest over its limit."""
-        sd, limit = next(iter(self.free.values()))
-        return (sd / limit) ** 2
-
     @cached_property
     def solved(self) -> tuple[Factors, np.ndarray]:
         """The prior of the fit with them free, and the step (M' + 1,) of all parameters."""
@@ -256,7 +262,7 @@ class Slopes:
 
     @cached_property
     def without(self) -> residuals.Innovations | None:
-        """The innovations of the data without them, tracks settled anew; None where the fit gains too little."""
+        """The innovations without them, tracks settled anew; None where the fit gains too little."""
         fit, prior, (factors, step), at = self.looked.fit, self.looked.fit.factors, self.solved, self.wider.at
         M, z = fit.problem.model.biases, np.asarray(fit.point.z)
         shift = self.looked.moves(self.wider, np.where(np.arange(len(step)) < M, 0.0, step))
@@ -279,48 +285,50 @@ class Slopes:
         return most, min(float(np.abs(own).max()), np.inf if len(own) == 1 else MOST * most)
 
 
-def _advice(name: str, kind: str, unit: str, scale: str, far: str) -> str:
-    """The line that declares a shape."""
+def _advice(name: str, what: str, unit: str, scale: str, far: str) -> str:
+    """The line that declares a shape of a channel."""
     if name == "time":
-        return f'they are late: give the node scale={{"time_offset": {scale}}}'
+        advice = 'correct their times, or give the first node of each scale={"time_offset": '
+        return f"{advice}{scale}}}"
     if name == "reading":
-        return f'multiply {kind} by 1 + gain, with a bias gain=Bias("1", {scale})'
+        return f'multiply {what} by 1 + gain, with a bias gain=Bias("1", {scale})'
     if name == "elevation":
         line = "probcal.geometry.elevation(target.position - pose.position)"
-        return f'add slope * {line} to {kind}, with a bias slope=Bias("{unit}", {scale})'
+        return f'add slope * {line} to {what}, with a bias slope=Bias("{unit}", {scale})'
     if name == "direction":
-        formula, of = (
-            "east * jnp.cos(a) + north * jnp.sin(a)",
-            "a = probcal.geometry.bearing(target.position - pose.position)",
-        )
-        return f'add {formula} to {kind}, {of}, with biases east and north=Bias("{unit}", {scale})'
+        line = "a = probcal.geometry.bearing(target.position - pose.position)"
+        biases = f'biases east and north=Bias("{unit}", {scale})'
+        return f"add east * jnp.cos(a) + north * jnp.sin(a) to {what}, {line}, with {biases}"
     line = f"r = probcal.geometry.norm(target.position - pose.position) / {far}"
-    return f'add slope * r + bend * r**2 to {kind}, {line}, with biases slope and bend=Bias("{unit}", {scale})'
+    return f'add slope * r + bend * r**2 to {what}, {line}, with biases slope and bend=Bias("{unit}", {scale})'
 
 
 def _said(found: Slopes) -> Checked:
-    """The findings: one sentence for all channels of a type that have a shape in common."""
+    """The findings: one sentence for a shape of a channel of a type."""
     looked, shapes, case = found.looked, found.wider.shapes, found.looked.case
     names, findings, after = case.channels.names, list[Finding](), found.without
     assert after is not None
-    alike = dict[tuple[str, str], list[int]]()
+    alike = dict[tuple[str, str, str], list[int]]()
     for k in found.free:
-        name, channels = shapes[k]
-        alike.setdefault((looked.kinds[channels[0]][1].name, name), []).append(k)
-    for (kind, name), own in alike.items():
+        name, (c, *_) = shapes[k]
+        channel = "" if name == "time" else names[c].rpartition(".")[2]
+        alike.setdefault((looked.kinds[c][1].name, channel, name), []).append(k)
+    for (kind, channel, name), own in alike.items():
         channels = tuple(dict.fromkeys(c for k in own for c in shapes[k].channels))
         mine = np.isin(case.channels.group, channels)
         if after.spread(mine) > case.innovations.spread(mine):  # it bends what something else has wrong
             continue
-        unit, (largest, size) = looked.kinds[channels[0]][2].unit, found.size(own[0])
-        shared = ', shared="type"' if all(looked.shapes[shapes[k]] for k in own) else ""
+        unit = "s" if name == "time" else looked.kinds[channels[0]][2].unit
+        largest, size = np.max([found.size(k) for k in own], 0)
+        shared = ', shared="type"' if name != "time" and all(looked.shapes[shapes[k]] for k in own) else ""
         sd, limit = found.free[own[0]]
+        most = size if name == "time" else largest
         text = (
             f"{listed([names[c] for c in channels])}: the residuals follow {SAID[name]}, by up to"
-            f" {largest:.2g}{f' {unit}' if unit != '1' else ''} ({sd:.1f} sd, limit {limit:.1f}; mean"
+            f" {most:.2g}{f' {unit}' if unit != '1' else ''} ({sd:.1f} sd, limit {limit:.1f}; mean"
             f" square {case.innovations.spread(mine):.2g}, {after.spread(mine):.2g} without): "
         )
-        text += _advice(name, kind, unit, f"{size:.2g}{shared}", f"{farthest(looked.fit):.0f}")
+        text += _advice(name, f"{channel} of {kind}", unit, f"{size:.2g}{shared}", f"{farthest(looked.fit):.3g}")
         findings.append(Finding("slope", names[channels[0]], text))
     if not findings:
         return Checked()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -63,11 +64,12 @@ class FramedChains(Chains):
         starts = []
         for k, key in enumerate(jax.random.split(keys[1], self.method.chains)):
             side = k % len(poses)
-            begun = chain_start(self.form, *poses[side], k, self.method.chains)
-            chain = self.method.first(self.form, poses[side][0], *begun, jax.random.key_data(key))
+            chain = _begun(
+                self.method.kernel(), self.form, *poses[side], k, self.method.chains, jax.random.key_data(key)
+            )
             own = jax.random.key_data(jax.random.fold_in(key, 1))
             starts.append(Sided(chain, jnp.asarray(side), own) if sides else chain)
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *starts)
 
     def advance(self, state: Any, thin: int) -> tuple[Any, Draw]:
         """All chains one chunk further, every `thin`-th step kept."""
@@ -81,6 +83,12 @@ class FramedChains(Chains):
             return run_together(run, method, form, self.where, state, steps)
         chains, threads = self.method.chains, self.context.threads
         return each_chain(lambda own: run(method, form, self.where, own, steps), state, chains, threads)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _begun(method: Any, form: Any, side: Any, drawn: Any, k: int, chains: int, key: jax.Array) -> Any:
+    """Chain k on a side, in one kernel."""
+    return method.first(form, side, *chain_start(form, side, drawn, k, chains), key)
 
 
 class FramedSampler(Sampler, ABC):

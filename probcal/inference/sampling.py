@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import FitError
@@ -209,11 +208,11 @@ def each_chain(one: Callable[[Any], tuple[Any, Draw]], states: Any, chains: int,
 
     def alone(k: int) -> tuple[Any, Draw]:
         with jax.enable_x64(True):
-            return jax.block_until_ready(one(jax.tree.map(lambda leaf: leaf[k], states)))
+            return jax.block_until_ready(one(jax.tree.map(lambda leaf: np.asarray(leaf)[k], states)))
 
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
         found = list(pool.map(alone, range(chains)))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *found)
 
 
 def gathered(arrays: Mapping[str, np.ndarray]) -> Draw:
