@@ -24,7 +24,7 @@ from probcal.problem import Problem
 from probcal.sensor import Channel
 
 LONGEST = 20.0  # s after which no other way is tried
-# what else speaks of it
+# checks that only speak of it
 SIGNS = ("levels", "process", "channels", "sensors", "rows", "slopes", "shape", "segments")
 
 Way = Callable[[np.ndarray], np.ndarray]
@@ -44,7 +44,7 @@ def ways(channel: Channel, signed: bool) -> Mapping[str, Way]:
 
 @check(causes=["misfit", "other"])
 def check_recoded(case: Case) -> Checked:
-    """A finding on the sensor, or the type, whose readings another convention explains and no answer as they are."""
+    """A finding on readings of a sensor, or a type, that fit if they are counted another way, and not as they are."""
     linear = all(form is None for form in case.fit.problem.model.sampled)
     if not (case.fit.engine.cheap and linear and case.innovations.spread(slice(None)) >= STANDS_OUT):
         return Checked()

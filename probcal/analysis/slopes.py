@@ -167,15 +167,13 @@ class _Looked:
         own = wider.members[list(free)]
         held[own] = LOOSE * (1.0 + wider.alone[own])
         held[:M] = 0.0
-        prior = np.where(
-            np.arange(len(held)) < M, np.minimum(self.fit.factors.diagonal(len(held)), most)[: len(held)], held
-        )
+        prior = np.where(np.arange(len(held)) < M, np.minimum(self.fit.factors.diagonal(len(held)), most), held)
         factors = Factors.alone(prior[:-1])
         pull = np.asarray(wider.at.slope()) + factors.pull(wider.at.point.z)
         return factors, held, np.append(np.asarray(wider.at.solve(factors, pull)), 0.0)
 
     def tests(self, wider: _Wider, free: Sequence[int] = ()) -> dict[int, Contrast]:
-        """Each shape by itself, those in `free` free too, by its number; in sd of what is told alone."""
+        """The test of each shape by its number, those in `free` left free."""
         factors, held, step = self.mean(wider, free, 1.0)
         inverse, found = invert(np.asarray(wider.at.marginals(factors, wider.members))), dict[int, Contrast]()
         score = np.einsum("bij,bj->bi", inverse, step[wider.members])
