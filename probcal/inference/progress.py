@@ -155,8 +155,8 @@ class Monitor:
             return
         try:
             self._progress(at)
-        except KeyboardInterrupt:
-            self.interrupt()
+        except KeyboardInterrupt as raised:
+            self.interrupt(signal.SIGTERM if isinstance(raised, Terminated) else signal.SIGINT)
 
     def interrupt(self, number: int = signal.SIGINT, _: Any = None) -> None:
         """The handler of a signal: stop the call where it has an answer.
