@@ -1,23 +1,31 @@
 """Do words keep their promise? Statuses, verdicts and warnings of fits whose truth is known, right models and wrong.
 
 uv run python benchmarks/verdicts.py --runs 100 --case beacons --case noise-halved
+uv run python benchmarks/verdicts.py --runs 200 --case own --file runs.jsonl
 
-One line a case: how fits ended; share of 89 % intervals that hold the truth, of all and of the non-zero biases; share
-of the biases called `determined` that lie beyond 4 sd; share of those with gamma above 0.9 that are called so; share of
-runs with a warning, and of what kind.
+Three tables. One row a case: how fits ended; share of 89 % intervals that hold the truth, of all and of the non-zero
+biases; share of the biases called `determined` that lie beyond 4 sd; share of those with gamma above 0.9 that are
+called so; share of runs with a warning, and of what kind. Then how many of what is called `determined`, and of the
+coordinates of tracks, lie within 2, 3 and 4 sd. Then, of paths drawn from their motion, false alarms by kind.
 """
 
 import argparse
+import json
 import sys
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import beta
 
 from probcal import ConstantVelocity, Network, Node, Problem, Target, assess, simulate
+from probcal.cli.models import load_problem, load_truth
 from probcal.errors import FitError
 from probcal.inference.fit import calibrate
+from probcal.labels import coordinates
+from probcal.results.read import each_track
 from probcal.sensors import doa
+from probcal.status import Status
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import networks
@@ -138,60 +146,173 @@ WRONG = {
 }
 MIRRORS = {name: right(name, 0.5) for name in ("line", "ceiling", "beside")}
 CASES = RIGHT | SMOOTH | MIRRORS | WRONG
+OWN = [name for name in RIGHT if name.endswith("own path")]
+RECORDED = {
+    "plaza": None, "plaza_free": None, "robots": "mrclam/MRCLAM_Dataset6", "sflab": "sflab_mic_toa/dataset_1_exp2.mat",
+    "tdoa_flight": "uwb_tdoa", "ble_office": "ble_rss", "bearing_beacons": "roh_bearing",
+}  # fmt: skip
+GROUPS = {"own": OWN, "right": [*RIGHT], "smooth": [*SMOOTH], "mirrors": [*MIRRORS], "wrong": [*WRONG]}
+GROUPS["recordings"] = [f"recording {name}" for name in RECORDED]
+SETTLED = [str(status) for status in Status if status.settled]
+DISTANCES = (2.0, 3.0, 4.0)  # sd
+WITHIN = [f"within {sd:g} sd, %" for sd in DISTANCES]
+MODELS = Path(networks.__file__).parent
+SHARED = MODELS.parent.parent / "shared" / "data"
+
+
+def recorded(name, data):
+    """A recording and the truth beside it, as its model file declares them."""
+
+    def make(run):
+        path = None if data is None else SHARED / data
+        module, problem = load_problem(MODELS / f"{name}.py", path)
+        return problem, load_truth(module, MODELS / f"{name}.py", path, problem)
+
+    return make
+
+
+RECORDINGS = {f"recording {name}": recorded(name, data) for name, data in RECORDED.items()}
+CASES |= RECORDINGS
 
 
 def one(case, run):
-    """What one run says: status, and (off in sd, held, non-zero, gamma, verdict) of its biases; kinds of findings."""
+    """What one run says, as plain data: lists of its biases; of its tracks the count beyond 0, 2, 3 and 4 sd."""
     problem, truth = CASES[case](run)
+    said = {"case": case, "run": run}
     try:
         tree, _ = calibrate(problem, key=run)
     except FitError:
-        return "refused", None, []
+        return said | {"status": "refused", "kinds": [], "tracks": [0, 0, 0, 0]}
     tree = assess(problem, tree)
-    group = tree["calibration"].to_dataset()
-    true = np.array([truth.biases.get(str(label), 0.0) for label in group["bias_label"].values])
-    off = np.abs(group["mean"].values - true) / group["sd"].values
-    held = (group["lower"].values <= true) & (true <= group["upper"].values)
-    said = tree["finding"].to_dataset()
-    pairs = zip(said["kind"].values.tolist(), said["subject"].values.tolist(), strict=True)
+    findings = tree["finding"].to_dataset()
+    pairs = zip(findings["kind"].values.tolist(), findings["subject"].values.tolist(), strict=True)
     kinds = list(dict.fromkeys("motion" if subject.startswith("motion.") else kind for kind, subject in pairs))
-    told = group["gamma"].values > PULLED
-    return tree.attrs["status"], (off, held, true != 0, told, tree["verdict"]["verdict"].values.astype(str)), kinds
+    said |= {"status": tree.attrs["status"], "kinds": kinds, "tracks": beyond(positions_off(tree, truth)).tolist()}
+    group = tree["calibration"].to_dataset().assign(word=tree["verdict"]["verdict"])
+    true = np.array([truth.biases.get(str(label), np.nan) for label in group["bias_label"].values])
+    group = group.isel(bias_label=np.isfinite(true))
+    true = true[np.isfinite(true)]
+    columns = {
+        "off": np.abs(group["mean"].values - true) / group["sd"].values,
+        "held": (group["lower"].values <= true) & (true <= group["upper"].values),
+        "nonzero": true != 0,
+        "told": group["gamma"].values > PULLED,
+        "word": group["word"].values.astype(str),
+    }
+    return said | {name: column.tolist() for name, column in columns.items()}
 
 
-def line(case, runs):
-    """The line of a case."""
-    statuses, kinds, warned, parts = Counter(), Counter(), 0, []
-    for run in range(runs):
-        status, part, found = one(case, run)
-        statuses[str(status)] += 1
-        kinds.update(found)
-        warned += bool(set(found) - set(NOTES)) or status != "converged"
-        parts += [] if part is None else [part]
-    if not parts:
-        return f"| {case} | refused {runs} | | | | 100 % |"
-    off, held, nonzero, told, word = (np.concatenate(column) for column in zip(*parts, strict=True))
-    called = word == "determined"
+def positions_off(tree, truth):
+    """How many sd each coordinate of each position lies off."""
+    off = [np.zeros(0)]
+    for name, track in each_track(tree):
+        axes = coordinates(track["component"].values.tolist())
+        at = track["time"].values
+        true = truth.positions(at, np.full(len(at), name), len(axes)) if truth.tracks is not None else np.nan
+        mean, sd = (track[of].sel(component=axes).values for of in ("mean", "sd"))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            off.append((np.abs(mean - true) / np.where(sd > 0, sd, np.nan)).ravel())
+    return np.concatenate(off)
+
+
+def beyond(off):
+    """How many lie off at all, and by more than 2, 3 and 4 sd."""
+    return np.array([np.isfinite(off).sum(), *((off > sd).sum() for sd in DISTANCES)])
+
+
+def made(case, run, kept, file):
+    """One run, from the file of runs if it is there, else made and added to it."""
+    if (case, run) not in kept:
+        kept[case, run] = one(case, run)
+        if file:
+            with file.open("a") as lines:
+                lines.write(json.dumps(kept[case, run]) + "\n")
+    return kept[case, run]
+
+
+def columns(runs, *names):
+    """Lists of biases of all runs that have an answer, laid end to end."""
+    return [np.concatenate([np.array(run[name]) for run in runs if name in run] or [np.zeros(0)]) for name in names]
+
+
+def row_of_words(case, runs):
+    """The row of a case in the table of words."""
+    statuses = Counter(run["status"] for run in runs)
+    kinds = Counter(kind for run in runs for kind in run["kinds"])
+    warned = sum(bool(set(run["kinds"]) - set(NOTES)) or run["status"] != "converged" for run in runs)
+    if set(statuses) == {"refused"}:
+        return f"| {case} | refused {len(runs)} | | | | 100 % |"
+    off, held, nonzero, told, word = columns(runs, "off", "held", "nonzero", "told", "word")
+    called, nonzero, told = word == "determined", nonzero.astype(bool), told.astype(bool)
     far = f"{100 * (off[called] > FAR).mean():.1f} % of {called.sum()}" if called.any() else "none called"
     right = f"{100 * called[told].mean():.0f} % of {told.sum()}" if told.any() else "none told"
     ended = ", ".join(f"{name} {count}" for name, count in statuses.most_common())
     named = ", ".join(f"{name} {count}" for name, count in kinds.most_common())
-    cover = f"{held.mean():.2f} / {held[nonzero].mean():.2f}"
-    return f"| {case} | {ended} | {cover} | {far} | {right} | {100 * warned / runs:.0f} % ({named}) |"
+    cover = f"{held.mean():.2f} / {held[nonzero].mean():.2f}" if nonzero.any() else "truth not known"
+    return f"| {case} | {ended} | {cover} | {far} | {right} | {100 * warned / len(runs):.0f} % ({named}) |"
+
+
+def row_of_reliability(case, runs):
+    """How much of what is called determined, and of the tracks of settled fits, lies within 2, 3 and 4 sd."""
+    off, word = columns(runs, "off", "word")
+    biases = beyond(off[word == "determined"])
+    tracks = np.sum([run["tracks"] for run in runs if run["status"] in SETTLED] or [np.zeros(4, int)], 0)
+
+    def cells(counts):
+        shares = [f"{100 - 100 * count / counts[0]:.1f}" if counts[0] else "" for count in counts[1:]]
+        return " | ".join([f"{counts[0]}", *shares])
+
+    return f"| {case} | {len(runs)} | {cells(biases)} | {cells(tracks)} |"
+
+
+def rows_of_rates(runs):
+    """False alarms by kind of finding among settled fits of right models, with 95 % intervals."""
+    settled = [run for run in runs if run["status"] in SETTLED]
+    kinds = Counter(kind for run in settled for kind in run["kinds"] if kind not in NOTES)
+    kinds["any of these"] = sum(bool(set(run["kinds"]) - set(NOTES)) for run in settled)
+    rows, count = [], len(settled)
+    for kind, hits in sorted(kinds.items(), key=lambda pair: (pair[0] == "any of these", -pair[1])):
+        lower = beta.ppf(0.025, hits, count - hits + 1) if hits else 0.0
+        upper = beta.ppf(0.975, hits + 1, count - hits) if hits < count else 1.0
+        rows.append(
+            f"| {kind} | {hits} of {count} | {100 * hits / count:.1f} | {100 * lower:.1f} to {100 * upper:.1f} |"
+        )
+    return rows
+
+
+def table(title, head, rows):
+    """Print a table as its rows come."""
+    print(f"\n{title}\n", f"| {' | '.join(head)} |", "|---" * len(head) + "|", sep="\n", flush=True)
+    for row in rows:
+        print(row, flush=True)
 
 
 def main():
-    """Print the table."""
+    """Print the tables."""
     ask = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    ask.add_argument("--runs", type=int, default=100)
-    ask.add_argument("--case", action="append", choices=["right", "smooth", "mirrors", "wrong", *CASES])
+    ask.add_argument("--runs", type=int, default=100, help="runs of each case; a recording has one")
+    ask.add_argument("--case", action="append", choices=[*GROUPS, *CASES])
+    ask.add_argument("--file", type=Path, help="a file of runs, a line each: those in it are not made again")
     given = ask.parse_args()
+    asked = [name for case in given.case or GROUPS for name in GROUPS.get(case, [case])]
+    lines = given.file.read_text().splitlines() if given.file and given.file.exists() else []
+    kept = {(run["case"], run["run"]): run for run in map(json.loads, lines)}
+    found = dict[str, list]()
+
+    def words():
+        for case in asked:
+            numbers = range(1 if case in RECORDINGS else given.runs)
+            found[case] = [made(case, run, kept, given.file) for run in numbers]
+            yield row_of_words(case, found[case])
+
     head = ("case", "ended", "held", "determined beyond 4 sd", "gamma > 0.9 determined", "runs with a warning")
-    print(f"| {' | '.join(head)} |", "|---" * len(head) + "|", sep="\n", flush=True)
-    groups = {"right": RIGHT, "smooth": SMOOTH, "mirrors": MIRRORS, "wrong": WRONG}
-    asked = [name for case in given.case or groups for name in groups.get(case, [case])]
-    for case in asked:
-        print(line(case, given.runs), flush=True)
+    table("What the words say", head, words())
+    head = ("case", "runs", "determined", *WITHIN, "coordinates of tracks", *WITHIN)
+    table("What they are worth", head, (row_of_reliability(case, runs) for case, runs in found.items()))
+    own_paths = [run for case, runs in found.items() if case in OWN for run in runs]
+    if own_paths:
+        head = ("finding", "fits", "%", "95 % interval")
+        table("False alarms, all own paths together", head, rows_of_rates(own_paths))
 
 
 if __name__ == "__main__":

@@ -19,12 +19,14 @@ try:
 except ImportError:  # Windows: drafts of a killed write stay
     fcntl = None  # type: ignore[assignment]
 
+type AnyPath = str | PathLike[str]
+
 LOCK = ".probcal.lock"
 NOTE = ".probcal.json"
 _DRAFT = re.compile(r"\..+\.probcal-[0-9a-f]{8}\.part")
 
 
-def write_whole(path: str | PathLike[str], data: bytes | memoryview | str) -> Path:
+def write_whole(path: AnyPath, data: bytes | memoryview | str) -> Path:
     """Write a file in one step: it is whole or absent, on a full disk too.
 
     What a killed write left in the folder is cleared. Raises `InputError` where the folder cannot be written.
@@ -104,7 +106,7 @@ def clear_drafts(folder: Path) -> None:
                     os.close(handle)
 
 
-def make_folder(path: str | PathLike[str]) -> Path:
+def make_folder(path: AnyPath) -> Path:
     """Make a folder and check that it can be written, before any work is done."""
     path = Path(path)
     try:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from probcal.errors import InputError, check_known, nearest
-from probcal.files import parsed_json, write_whole
+from probcal.files import AnyPath, parsed_json, write_whole
 from probcal.geodesy import GEODETIC, LocalFrame, check_place, earth_axes
 from probcal.labels import coordinates, step_of, unescaped
 from probcal.lazy import pd, xr
@@ -58,9 +58,7 @@ def _turned(components: Mapping[str, float], axes: np.ndarray) -> dict[str, floa
     return {**components, **{name: float(angle) for name, angle in zip(ANGLES, turned, strict=True)}}
 
 
-def read_nodes(
-    source: str | PathLike[str] | pd.DataFrame, *, origin: Sequence[float] | LocalFrame | None = None
-) -> Nodes:
+def read_nodes(source: AnyPath | pd.DataFrame, *, origin: Sequence[float] | LocalFrame | None = None) -> Nodes:
     """Nodes by name from CSV, GeoJSON (Point features, the columns as properties) or a DataFrame.
 
     Columns: `node` (or `name`); `x, y[, z]` in m or `latitude, longitude[, height]` in degrees and m; optional
@@ -230,7 +228,7 @@ def _bias(table: Table, row: int, unit: str, scale: float) -> Bias:
         raise InputError(f"{table.where(row)}: {error}") from None
 
 
-def write_network(path: str | PathLike[str], network: Network) -> Path:
+def write_network(path: AnyPath, network: Network) -> Path:
     """Write all that a network states as CSV, each number exact: a row per component of a node and bias of a sensor.
 
     Columns: `name` (the label of the bias that it has or might have, such as `mast.position_x`), `of` (node, sensor or
@@ -257,7 +255,7 @@ def write_network(path: str | PathLike[str], network: Network) -> Path:
     return write_whole(path, csv_text(pd.DataFrame(rows)))
 
 
-def read_network(path: str | PathLike[str], network: Network) -> dict[str, tuple[float, float]]:
+def read_network(path: AnyPath, network: Network) -> dict[str, tuple[float, float]]:
     """Value and sd by label, of the biases of a network whose sds a file of `write_network` has.
 
     Sensors and nodes that the network does not have are left out. Raises `InputError` naming file, row and name.
@@ -306,7 +304,7 @@ class _Record(NamedTuple):
 
 
 def write_nodes(
-    path: str | PathLike[str],
+    path: AnyPath,
     nodes: xr.DataTree | Mapping[str, Node] | Iterable[Node],
     *,
     frame: LocalFrame | None = None,

@@ -7,7 +7,6 @@ from copy import copy
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from numbers import Real
-from os import PathLike
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +14,7 @@ import numpy as np
 
 from probcal.clocks import CLOCK
 from probcal.errors import InputError, check_known, nearest
+from probcal.files import AnyPath
 from probcal.labels import NOBODY
 from probcal.lazy import pd
 from probcal.linalg import handedness
@@ -145,7 +145,7 @@ class Problem:
         self,
         network: Network,
         motion: Any = None,
-        data: str | PathLike[str] | pd.DataFrame | Table | None = None,
+        data: AnyPath | pd.DataFrame | Table | None = None,
         *,
         fix: Mapping[str, float] | Iterable[str] = (),
         epoch: float | None = None,

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from probcal.errors import InputError, check_known
-from probcal.files import write_whole
+from probcal.files import AnyPath, write_whole
 from probcal.labels import NOBODY, coordinates, listed, unescaped
 from probcal.lazy import pd
 from probcal.linalg import library
@@ -72,7 +71,7 @@ class Truth:
     {'sonar_1.range_offset': 8.0}
     """
 
-    tracks: pd.DataFrame | str | PathLike[str] | None = None
+    tracks: pd.DataFrame | AnyPath | None = None
     biases: Mapping[str, float] = field(default_factory=dict)
     source: str = field(default="", init=False, repr=False)  # name of the table of the tracks
 
@@ -140,7 +139,7 @@ class Simulation:
     table: pd.DataFrame
     truth: Truth
 
-    def write(self, path: str | PathLike[str]) -> list[Path]:
+    def write(self, path: AnyPath) -> list[Path]:
         """Write PATH and, beside it, PATH's `.tracks.csv` and `.biases.csv`; returns the files."""
         path = Path(path)
         biases = pd.DataFrame(self.truth.biases.items(), columns=["bias", "value"])
@@ -164,7 +163,7 @@ def _interpolated(time: np.ndarray, known: np.ndarray, values: np.ndarray) -> np
     return np.where(inside[:, None], found, np.nan)
 
 
-def truth_beside(path: str | PathLike[str]) -> Truth | None:
+def truth_beside(path: AnyPath) -> Truth | None:
     """Truth that `Simulation.write` left beside a table, or None."""
     tracks, biases = _beside(Path(path))
     values = _biases_of(read_table(biases)) if biases.exists() else {}

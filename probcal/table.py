@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from probcal.errors import InputError, check_known, nearest
+from probcal.files import AnyPath
 from probcal.labels import NOBODY, check_name, escaped, unescaped
 from probcal.lazy import pd
 from probcal.network import Network
@@ -94,7 +95,7 @@ class Measurements:
     floors: Mapping[tuple[int, str], float] = field(default_factory=dict)  # found, by number of the type and channel
 
 
-def read_table(source: str | PathLike[str] | pd.DataFrame | Table) -> Table:
+def read_table(source: AnyPath | pd.DataFrame | Table) -> Table:
     """Read a CSV file or take a DataFrame; raises `InputError` naming the file if it is not a table.
 
     >>> import pandas as pd

@@ -862,3 +862,12 @@ def test_tracks_hold_where_noise_is_remembered():
         assert (biases["sd"] <= np.maximum(biases["scale"], before) * (1 + 1e-9)).all()
     assert np.mean(held[2.0]) > 0.8
     assert np.mean(held[0.0]) > 0.85
+
+
+def test_the_interval_under_a_gaussian_prior_is_that_of_such_a_fit():
+    """Exact where the problem is linear, though the fit took another prior and ended elsewhere."""
+    problem = worlds.linear("plane")[0]
+    verdict = assess(problem, probcal.fit(problem, EA()))["verdict"]
+    plain = probcal.fit(problem, MAP(), prior=probcal.Gaussian())["calibration"]
+    for side in ("lower", "upper"):
+        np.testing.assert_allclose(verdict[f"gaussian_{side}"], plain[side], rtol=1e-5, atol=1e-7)

@@ -437,6 +437,31 @@ def test_a_bias_that_shares_an_open_combination_is_weak_and_names_it():
     assert {word for m, word in enumerate(words) if m != 1} == {"determined"}
 
 
+def test_what_sparsity_decides_and_what_stands_apart_are_said():
+    """Both intervals where the fit is much narrower than a Gaussian prior leaves; an open combination comes first."""
+    problem, _ = linear("plane")
+    M = len(problem.labels)
+    scales = np.array([bias.scale for bias in problem.biases])
+    narrow, wide = np.full(M, 0.3), np.full(M, 0.9)
+    apart = {0: "it stands apart from the others"}
+
+    def judged(sharper, share, doubts):
+        known = verdict.Grounds(
+            np.full(M, share), np.zeros(M), 3.0, 1.0, verdict.gaussian_interval(np.full(M, 0.5), 0.25), sharper
+        )
+        return verdict.judge_biases(problem, Status.CONVERGED, ["estimated"] * M, known, doubts)
+
+    words, reasons = judged(narrow, 0.4, {"relative": apart})
+    assert set(words) == {"by the prior"}, "what the data tell by less than half is no verdict on the others"
+    half = 0.25 * 1.5982
+    assert f"leaves {(0.5 - half) * scales[1]:.2g} to {(0.5 + half) * scales[1]:.2g} m" in reasons[1]
+    assert set(judged(wide, 0.4, {})[0]) == {"weak"}
+    words, reasons = judged(narrow, 0.9, {"relative": apart})
+    assert words == ["relative"] + ["by the prior"] * (M - 1)
+    assert reasons[0] == apart[0]
+    assert set(judged(wide, 0.9, {})[0]) == {"determined"}
+
+
 def test_a_survey_is_in_conflict_only_where_it_explains_part_of_the_misfit():
     problem, _ = linear("plane")
     M = len(problem.labels)

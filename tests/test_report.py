@@ -228,6 +228,15 @@ def test_the_verdict_is_one_sentence_and_what_matters_comes_first():
         "The fit converged: 1 of 8 biases differs from zero, most clearly south.range_offset at 9.0 ±"
     )
     assert line.endswith("; 5 determined, 1 conflicting, 1 weak, 1 prior only.")
+    assert said.left_open(tree) == "The data alone do not tell 2 of 8 biases: south.position_x, south.position_y."
+    assert said.next_step(tree) == "No check asks for a change of the model."
+    open_one = {"direction": ["all along x"], "remedy": ["survey south"], "information": [0.1]}
+    tree["direction"] = xr.DataTree(xr.Dataset({name: ("direction", own) for name, own in open_one.items()}))
+    assert said.left_open(tree).endswith("; left open: all along x.")
+    assert said.next_step(tree) == "To tell all along x: survey south."
+    columns = {"kind": ["loo", "slope"], "sentence": ["rows are badly predicted", "south.range bends"]}
+    tree["finding"] = xr.DataTree(xr.Dataset({name: ("finding", own) for name, own in columns.items()}))
+    assert said.next_step(tree) == "To look at first: south.range bends."
     rows, left = said.that_matter(tree)
     assert [row.label for row in rows] == ["north.range_offset", "south.range_offset", "south.position_x"]
     assert left == 0
@@ -401,6 +410,22 @@ def test_map_ellipse_holds_the_stated_probability():
     stated = tree["constant_data"]["node_position"].values[0]
     shift = [float(group["mean"].sel(bias_label=f"north.position_{axis}")) for axis in "xy"]
     np.testing.assert_allclose(ellipse.center, stated + shift)
+
+
+def test_small_displacements_are_drawn_at_a_scale_that_the_legend_names():
+    tree = make(nodes=("north",))
+    group = tree["calibration"].to_dataset()
+    shift = np.array([0.4, 0.0])  # of some kilometres
+    group["mean"][:2], group["covariance"][:2, :2] = shift, 0.01 * np.eye(2)
+    tree["calibration"] = xr.DataTree(group)
+    ax = plots.plot_map(tree)
+    (label,) = [text.get_text() for text in ax.get_legend().get_texts() if "ellipse" in text.get_text()]
+    times = float(re.search(r"ellipse \N{MULTIPLICATION SIGN} (\d+)", label)[1])
+    (ellipse,) = [patch for patch in ax.patches if isinstance(patch, Ellipse)]
+    np.testing.assert_allclose(ellipse.center, tree["constant_data"]["node_position"].values[0] + times * shift)
+    assert 0.04 < times * 0.4 / np.ptp(ax.get_xlim()) <= 0.12
+    tree["calibration"]["covariance"][:2, :2] = np.eye(2)
+    assert not any("shift and" in text.get_text() for text in plots.plot_map(tree).get_legend().get_texts())
 
 
 def test_map_ellipse_leans_with_the_correlation():

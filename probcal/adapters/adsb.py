@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from os import PathLike
 from typing import Any
 
 import numpy as np
 
 from probcal.adapters.shared import check_frame, instant, reports
 from probcal.errors import InputError, nearest
+from probcal.files import AnyPath
 from probcal.geodesy import LocalFrame
 from probcal.lazy import pd
 from probcal.table import Table, name_as_text, numbers, read_table, split_header, unit_factor
@@ -32,7 +32,7 @@ TRUE = ("true", "1", "1.0", "t", "yes")
 
 
 def read_adsb(
-    source: str | PathLike[str] | pd.DataFrame,
+    source: AnyPath | pd.DataFrame,
     frame: LocalFrame,
     *,
     dimension: int = 3,

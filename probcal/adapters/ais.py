@@ -13,6 +13,7 @@ import numpy as np
 
 from probcal.adapters.shared import KNOT, check_frame, extra, file_bytes, instant, reports
 from probcal.errors import InputError
+from probcal.files import AnyPath
 from probcal.geodesy import LocalFrame
 from probcal.lazy import pd
 
@@ -25,7 +26,7 @@ NO_SPEED = {27: 63.0}  # knots at or above which a speed is not reported, 102.3 
 
 
 def read_ais(
-    source: str | PathLike[str] | Iterable[str | bytes],
+    source: AnyPath | Iterable[str | bytes],
     frame: LocalFrame,
     *,
     sensor: str = "ais",

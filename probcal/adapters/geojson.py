@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from probcal.adapters.shared import check_frame, file_bytes, instant, since
 from probcal.errors import InputError
-from probcal.files import parsed_json, write_whole
+from probcal.files import AnyPath, parsed_json, write_whole
 from probcal.geodesy import GEODETIC, LocalFrame, check_place
 from probcal.labels import AXES
 from probcal.lazy import pd, xr
@@ -25,7 +24,7 @@ CORNERS = 36  # of an ellipse
 
 
 def read_geojson(
-    path: str | PathLike[str],
+    path: AnyPath,
     frame: LocalFrame,
     *,
     sensor: str = "geojson",
@@ -74,7 +73,7 @@ def read_geojson(
     return table
 
 
-def _features(path: str | PathLike[str]) -> list[Any]:
+def _features(path: AnyPath) -> list[Any]:
     """Features of a file."""
     name = Path(path).name
     try:
@@ -146,7 +145,7 @@ def _flat(where: str, parts: Any) -> list[Any]:
 
 
 def write_geojson(
-    path: str | PathLike[str],
+    path: AnyPath,
     tree: xr.DataTree,
     frame: LocalFrame | None = None,
     *,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from probcal.adapters.shared import SECOND, check_frame, extra, since
 from probcal.errors import InputError, nearest
+from probcal.files import AnyPath
 from probcal.geodesy import LocalFrame
 from probcal.lazy import pd
 from probcal.table import UNITS, split_header
@@ -69,7 +69,7 @@ class Topic:
 
 
 def read_bag(
-    path: str | PathLike[str],
+    path: AnyPath,
     topics: Mapping[str, Topic],
     *,
     frame: LocalFrame | None = None,

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from importlib import import_module
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from probcal.errors import InputError, nearest
+from probcal.files import AnyPath
 from probcal.geodesy import LocalFrame
 from probcal.labels import AXES
 from probcal.lazy import pd
@@ -33,7 +33,7 @@ def extra(module: str, what: str, name: str) -> Any:
         raise InputError(f'{what} needs the package {root}: pip install "probcal[{name}]"') from None
 
 
-def file_bytes(path: str | PathLike[str]) -> bytes:
+def file_bytes(path: AnyPath) -> bytes:
     """What a file holds; raises `InputError` naming it."""
     try:
         return Path(path).read_bytes()

@@ -8,11 +8,12 @@ import xarray as xr
 from probcal.analysis.check import Case, Checked
 from probcal.analysis.checks import CHECKS
 from probcal.analysis.findings import Finding, alarms, finding_group, in_order
-from probcal.analysis.verdict import RATE, VERDICTS, Grounds, explained_part, judge_biases, limit_of, pull
+from probcal.analysis.verdict import RATE, Grounds, explained_part, gaussian_interval, judge_biases, limit_of, pull
 from probcal.inference.fitted import take_up
 from probcal.inference.widen import said, sentence, unwidened, widened
 from probcal.problem import Problem
 from probcal.results.groups import along, bias_coords
+from probcal.results.schema import VERDICTS
 from probcal.simulate import Key, Truth, as_key, derived_keys
 from probcal.status import Status
 from probcal.types import float64
@@ -31,7 +32,9 @@ def assess(problem: Problem, tree: xr.DataTree, *, truth: Truth | None = None, k
       `linearised` says for which levels of a large network that was worked out.
     - `halves`: what each bias alone would change from the first half of the recording to the second.
     - `sensitivity`: power scaling of prior and likelihood, where the tree holds both.
-    - `verdict`: `verdict` and `reason` of every bias (rules in `probcal.analysis.verdict`); `finding`: sentences.
+    - `verdict`: `verdict` and `reason` of every bias (rules in `probcal.analysis.verdict`), and its
+      interval under a Gaussian prior of its scale, `gaussian_lower` and `gaussian_upper`;
+      `finding`: sentences.
 
     Where the innovations reject the model (p below 0.001: their mean square, or their correlation in time) the sd,
     intervals, covariance and draws of the biases are widened by what they call for, and a finding says so.
@@ -84,11 +87,16 @@ def _verdicts(case: Case, found: list[Checked]) -> xr.Dataset:
     narrowed = np.clip(1.0 - case.declared.variance, 0.0, 1.0)
     z, alpha, gamma = np.asarray(fit.point.z), group["precision"].values, group["gamma"].values
     part = explained_part(z, alpha, gamma, case.innovations.excess)
-    known = Grounds(narrowed, pull(z, alpha, gamma, inflation), float(np.sqrt(limit_of(len(z)))), part)
+    sd = np.sqrt(np.maximum(case.declared.variance, 1e-300))
+    wide = np.maximum(inflation, 1.0) if case.rejected.reason else 1.0  # as the fit is widened
+    gaussian = gaussian_interval(case.declared_mean, sd * np.sqrt(1.0 + narrowed * (wide - 1.0)))
+    sharper, limit = group["sd"].values / (problem.scales * sd), float(np.sqrt(limit_of(len(z))))
+    known = Grounds(narrowed, pull(z, alpha, gamma, inflation), limit, part, gaussian, sharper)
     doubts = {word: dict(ChainMap(*(dict(own.doubts.get(word, {})) for own in reversed(found)))) for word in VERDICTS}
     remarks = {m: text for own in found for m, text in own.remarks.items()}
     status, ended = Status(case.tree.attrs["status"]), group["status"].values.tolist()
     words, reasons = judge_biases(problem, status, ended, known, doubts, remarks)
     values = {"verdict": np.array(words, str), "reason": np.array(reasons, str), "contraction": narrowed}
-    values |= {"inflation": inflation}
+    lower, upper = gaussian * problem.scales
+    values |= {"inflation": inflation, "gaussian_lower": lower, "gaussian_upper": upper}
     return xr.Dataset(along("bias_label", values), bias_coords(problem), {"rate": RATE, "limit": known.limit})

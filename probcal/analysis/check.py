@@ -19,6 +19,7 @@ from probcal.analysis import predictive
 from probcal.analysis.findings import Finding
 from probcal.errors import InputError
 from probcal.gaussian.draws import many_data
+from probcal.gaussian.engine import Factors
 from probcal.inference import residuals
 from probcal.inference.fitted import Judged
 from probcal.inference.widen import Rejection, rejection
@@ -109,6 +110,12 @@ class Case:
             return found
         information = self.tree["calibration"].to_dataset()["information"].values
         return SensorBlocks.of(invert(information + np.eye(len(information))))
+
+    @cached_property
+    def declared_mean(self) -> np.ndarray:
+        """The mean (M,) of z under a Gaussian prior of the declared scales, about the fit."""
+        at, z = self.fit.expansion, np.asarray(self.fit.point.z)
+        return z + np.asarray(at.solve(Factors.alone(np.ones(len(z))), np.asarray(at.score()) - z))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ not learn) and explains a
              limit, after what stronger changes explain
 prior only   s < 0.05
 weak         s < 0.5 (information below 1), or one scale along a combination of biases that the data leave open would
-             put it more than 1.8 sd off, or it would move by more than one sd with the noise levels
+             put it more than 1.8 sd off and it is not clearly away from zero, or it would move
+             by more than one sd with the noise levels
              that the data ask for or if the biases that drift were free to, or if what a channel leaves follows the
              geometry (`analysis.slopes`), or it lies beyond the
              limit of its survey by a misfit that is mostly elsewhere, or it is another one in an
@@ -20,6 +21,9 @@ weak         s < 0.5 (information below 1), or one scale along a combination of 
              at bound, diverged), or the chains of the bias have not mixed, or it was pruned: held at zero by
              a precision that was maximised; all are "conflicting" where the fit explains nothing
              (misfit)
+relative     clearly away from zero, as the prior shares out a combination of biases that the data
+             leave open: it stands apart from the others of that, all of which may be off together
+by the prior its sd is less than half of what a Gaussian prior of its scale leaves: sparsity decides
 determined   none of these
 
 Limits have a false-alarm rate of 1 % over all biases together, and the standard deviations behind them carry the
@@ -35,13 +39,15 @@ import numpy as np
 from scipy import special
 
 from probcal.problem import Problem
+from probcal.results.schema import INTERVAL
 from probcal.status import Status
 
 RATE = 0.01  # false alarms of each kind of check, all its comparisons together
 PRIOR_ONLY, WEAK = 0.05, 0.5
 # share of the chi-square of the innovations above its mean from which a bias is one of its causes
 PART = 0.1
-VERDICTS = ("determined", "prior only", "weak", "drifting", "conflicting")
+# sd of a bias, in that under a Gaussian prior of its scale, below which sparsity decides
+SHARP = 0.5
 
 
 Doubts = Mapping[str, Mapping[int, str]]  # reason by bias, by the verdict that it is for
@@ -55,6 +61,15 @@ class Grounds(NamedTuple):
     limit: float  # of pull
     # share of the chi-square that the innovations have too much which the bias alone explains
     part: Any = 1.0
+    # lower and upper end of the interval that a Gaussian prior of the declared scale leaves
+    gaussian: Any = (0.0, 0.0)
+    sharper: Any = 1.0  # sd of the fit in the one that such a prior leaves
+
+
+def gaussian_interval(mean: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Lower and upper end (2, M) of the interval of a Gaussian."""
+    half = special.ndtri(0.5 + 0.5 * INTERVAL) * sd
+    return np.stack([mean - half, mean + half])
 
 
 def narrowed(share: float) -> str:
@@ -103,7 +118,8 @@ def judge_biases(
     def charged(word: str, m: int) -> list[tuple[bool, str, str]]:
         return [(True, word, doubts[word][m])] if m in doubts.get(word, {}) else []
 
-    explained = np.broadcast_to(known.part, len(problem.biases))
+    numbers = (known.part, known.sharper, *known.gaussian)
+    explained, sharper, lower, upper = (np.broadcast_to(own, len(problem.biases)) for own in numbers)
     for m, bias in enumerate(problem.biases):
         s, unit = known.contraction[m], bias.unit if bias.unit != "1" else ""
         declared = bias.kind
@@ -111,6 +127,8 @@ def judge_biases(
         information = f"information {s / max(1 - s, 1e-12):.2g}"
         beyond = f"{known.pull[m]:.1f} sd beyond its {declared} of {_size(bias.scale, unit)} (limit {known.limit:.1f})"
         far, part = known.pull[m] > known.limit, explained[m]
+        sharp = sharper[m] < SHARP
+        left = f"{lower[m] * bias.scale:.2g} to {_size(upper[m] * bias.scale, unit)}"
         elsewhere = f"{beyond}, by a misfit elsewhere: it explains {part:.1g} of the excess of the innovations"
         cases = (  # the first that holds counts
             (not status.explains, "conflicting", "the fit ended misfit: model and data contradict each other"),
@@ -118,12 +136,14 @@ def judge_biases(
             (far and part >= PART, "conflicting", beyond),
             *charged("conflicting", m),
             (s < PRIOR_ONLY, "prior only", f"the data hardly narrow its {declared} ({information})"),
-            (s < WEAK, "weak", f"the data narrow its {sizes} only ({information})"),
+            (s < WEAK and not sharp, "weak", f"the data narrow its {sizes} only ({information})"),
             (far, "weak", elsewhere),
             *charged("weak", m),
             (not status.settled, "weak", f"the fit ended {status}: its interval is not valid"),
             (ended[m] == "not mixed", "weak", "its chains have not mixed: its interval is not valid"),
             (ended[m] == "pruned", "weak", "pruned: its precision was maximised, so its interval is not valid"),
+            *(charged("relative", m) if s >= WEAK else []),
+            (sharp, "by the prior", f"sparsity decides; a Gaussian prior of its {declared} leaves {left}"),
             (True, "determined", f"the data narrow its {sizes}"),
         )
         verdict, reason = next((verdict, reason) for holds, verdict, reason in cases if holds)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from importlib.metadata import version
-from os import PathLike
 from typing import Any
 
 import jax
 import numpy as np
 
+from probcal.files import AnyPath
 from probcal.fingerprint import ADDRESS, computes
 from probcal.inference.storage import Storage
 from probcal.model.rows import Block, Rows, information, log_likelihood, weigh
@@ -28,7 +28,7 @@ def identity_of(problem: Problem, **settings: Any) -> dict[str, str]:
 
 
 def stored_fit(
-    store: str | PathLike[str] | None, problem: Problem, method: Any, prior: Prior, key: jax.Array, start: Any,
+    store: AnyPath | None, problem: Problem, method: Any, prior: Prior, key: jax.Array, start: Any,
     starts: int, *, resume: bool, overwrite: bool,
 ) -> Storage:  # fmt: skip
     """The storage of a fit, in memory where no folder is given: of a sampler's draws, or of the states of climbs."""

@@ -9,11 +9,10 @@ import os
 import re
 from collections.abc import Mapping
 from contextlib import suppress
-from os import PathLike
 from pathlib import Path
 
 from probcal.errors import InputError
-from probcal.files import Lock, cannot_write, write_whole
+from probcal.files import AnyPath, Lock, cannot_write, write_whole
 
 MANIFEST = "probcal-run.json"
 KINDS = {"draws": "chunk", "climb": "loop", "sbc": "runs"}  # what a folder holds: the name of its numbered parts
@@ -34,7 +33,7 @@ def check_choice(resume: bool, overwrite: bool) -> None:
 
 
 def check_same(
-    path: str | PathLike[str], identity: Mapping[str, str], there: Mapping[str, str],
+    path: AnyPath, identity: Mapping[str, str], there: Mapping[str, str],
     remedy: str = f"give another folder, or {OVERWRITE}",
 ) -> None:  # fmt: skip
     """Raise `InputError` where the run in a folder is not the one to go on with, by the name of what differs."""
@@ -140,7 +139,7 @@ def remove_parts(path: Path, lock: Lock, *, folder: bool) -> None:
             path.rmdir()
 
 
-def remove_run(path: str | PathLike[str], digest: str) -> None:
+def remove_run(path: AnyPath, digest: str) -> None:
     """Remove the parts of the run with this digest; any other run and any other file stay."""
     path = Path(path)
     try:
@@ -151,12 +150,12 @@ def remove_run(path: str | PathLike[str], digest: str) -> None:
         remove_parts(path, Lock(path), folder=True)
 
 
-def stored_digest(path: str | PathLike[str]) -> str:
+def stored_digest(path: AnyPath) -> str:
     """Digest of the run in a folder; empty where there is none."""
     return digest_of(*read_manifest(Path(path))) if stored_run(path) else ""
 
 
-def stored_run(path: str | PathLike[str]) -> str:
+def stored_run(path: AnyPath) -> str:
     """What the run in a folder is, in a few words; empty where there is none."""
     path = Path(path)
     if not path.is_dir() or not (path / MANIFEST).exists() or not holds_parts(path):

@@ -155,8 +155,10 @@ class Monitor:
             return
         try:
             self._progress(at)
-        except KeyboardInterrupt as raised:
-            self.interrupt(signal.SIGTERM if isinstance(raised, Terminated) else signal.SIGINT)
+        except Terminated:
+            self.interrupt(signal.SIGTERM)
+        except KeyboardInterrupt:
+            self.interrupt()
 
     def interrupt(self, number: int = signal.SIGINT, _: Any = None) -> None:
         """The handler of a signal: stop the call where it has an answer.

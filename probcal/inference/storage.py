@@ -15,7 +15,6 @@ import os
 import time
 import zipfile
 from collections.abc import Mapping, Sequence
-from os import PathLike
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -23,7 +22,7 @@ from typing import Any, Self
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.files import Lock, clear_drafts, make_folder, write_whole
+from probcal.files import AnyPath, Lock, clear_drafts, make_folder, write_whole
 from probcal.inference.manifest import (
     KINDS,
     MANIFEST,
@@ -57,7 +56,7 @@ class Storage:
     """
 
     def __init__(
-        self, path: str | PathLike[str] | None, kind: str, identity: Mapping[str, str], *, resume: bool = False,
+        self, path: AnyPath | None, kind: str, identity: Mapping[str, str], *, resume: bool = False,
         overwrite: bool = False,
     ):  # fmt: skip
         check_choice(resume, overwrite)

@@ -1,17 +1,19 @@
 """Pictures of an assessment: shrinkage with verdicts, NIS by epoch, sensors left out, change between halves."""
 
-from os import PathLike
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
+from probcal.files import AnyPath
 from probcal.plots.base import (
     COLOURS,
+    FAINT,
     NAMED,
     POINTS,
     ROWS,
+    SURE,
     colour,
     figure_of,
     finish,
@@ -26,7 +28,8 @@ from probcal.results.read import each_track
 
 # the words of a verdict, each with its colour and mark
 VERDICTS = {
-    "determined": (COLOURS[2], "o"), "weak": (COLOURS[4], "s"), "prior only": ("#8c8c8c", "v"),
+    "determined": (COLOURS[2], "o"), "relative": (SURE, "D"), "by the prior": (FAINT, "p"),
+    "weak": (COLOURS[4], "s"), "prior only": ("#8c8c8c", "v"),
     "drifting": (COLOURS[1], "^"), "conflicting": (COLOURS[3], "X"),
 }  # fmt: skip
 
@@ -106,7 +109,7 @@ def plot_changes(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     return _draw_changes(group, moved, difference, title, ax)
 
 
-def draw_changes(tree: xr.DataTree, path: str | PathLike[str]) -> None:
+def draw_changes(tree: xr.DataTree, path: AnyPath) -> None:
     """Write the picture of what moved between two recordings."""
     write_figure(figure_of(plot_changes(tree)), path, 120)
 

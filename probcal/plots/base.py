@@ -2,7 +2,6 @@
 
 import io
 from collections.abc import Iterable, Sequence
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from probcal.files import write_whole
+from probcal.files import AnyPath, write_whole
 from probcal.plots.scene import ellipse
 from probcal.results.schema import INTERVAL
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d00", "#5d3a9b")
 BEFORE = "#a6a6a6"
+REACH = 0.12  # longest arrow on a map, in its widths
 GAMMA = "viridis_r"  # light: prior only, dark: data only
 PALE, FAINT, SURE = "#e0e0e0", "#b5b5b5", "#c2185b"  # an object that hardly exists: on white, on any; one that does
 POINTS = 3_000  # of one track
@@ -93,7 +93,7 @@ def most_first(size: np.ndarray) -> np.ndarray:
     return np.sort(np.argsort(-size, kind="stable")[:ROWS])
 
 
-def write_figure(figure: Figure, path: str | PathLike[str], dpi: float) -> None:
+def write_figure(figure: Figure, path: AnyPath, dpi: float) -> None:
     """Write a figure in one step, in the format that the name ends with."""
     sheet = io.BytesIO()
     figure.savefig(sheet, format=Path(path).suffix.removeprefix(".") or "png", dpi=dpi)

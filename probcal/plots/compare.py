@@ -1,7 +1,6 @@
 """Pictures of fits side by side: forest of methods, gamma against gamma, posterior of a pair of biases."""
 
 from collections.abc import Mapping, Sequence
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from probcal.analysis.compare import Fits, chosen_pair, fits_by_name, interchangeable, plugged_in
+from probcal.files import AnyPath
 from probcal.plots.base import (
     ROWS,
     colour,
@@ -124,9 +124,7 @@ def plot_pair(fits: Fits, labels: Sequence[str], names: Sequence[str] | None = N
     return finish(ax, "Posterior of a pair of biases", keys=keys, xlabel=across, ylabel=up)
 
 
-def draw_compare(
-    comparison: xr.DataTree, fits: Fits, path: str | PathLike[str], pairs: Sequence[Sequence[str]] = ()
-) -> None:
+def draw_compare(comparison: xr.DataTree, fits: Fits, path: AnyPath, pairs: Sequence[Sequence[str]] = ()) -> None:
     """Write the pictures of a comparison to one file: forest, gammas, and pairs of biases.
 
     `fits` are those compared; where no pair is given the most interchangeable ones of the reference are drawn.

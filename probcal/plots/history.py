@@ -1,13 +1,13 @@
 """The history of biases that `probcal watch` writes, with their intervals and the jumps that were found."""
 
 from collections.abc import Sequence
-from os import PathLike
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
 from probcal.errors import check_known
+from probcal.files import AnyPath
 from probcal.plots.base import BEFORE, SURE, colour, panels, plain_text, write_figure
 
 COLUMNS, PANELS = 4, 24  # panels of a row, and at most
@@ -59,6 +59,6 @@ def plot_history(
     return figure
 
 
-def draw_history(history: pd.DataFrame, jumps: pd.DataFrame | None, path: str | PathLike[str]) -> None:
+def draw_history(history: pd.DataFrame, jumps: pd.DataFrame | None, path: AnyPath) -> None:
     """Write the picture of a history."""
     write_figure(plot_history(history, jumps=jumps), path, 130)

@@ -17,6 +17,7 @@ from probcal.plots.base import (
     FEW,
     PALE,
     POINTS,
+    REACH,
     SURE,
     colour,
     ellipse_patch,
@@ -36,7 +37,8 @@ def plot_map(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     Dotted: the true tracks, where `add_scores` has met them. Dashed: the tracks of an answer on the other side of a
     mirror that fits as well, and the way to where a node stands in such an answer (a ring). Of detections that nobody
     named: a broad line where an object was, in the colour of its existence and faint where that is small; and what each
-    sensor sees, from where it was found to stand.
+    sensor sees, from where it was found to stand. Where nodes clearly moved by less than can be
+    seen, displacements and ellipses are drawn so many times as large as the legend says.
     """
     ax = new_axes(ax, 9.0, 6.5)
     ax.set_aspect("equal", adjustable="box")
@@ -124,12 +126,27 @@ def _draw_nodes(ax: Axes, nodes: Places, probability: float) -> list[Line2D]:
                 *stated[chosen].T, marker, zorder=5, color="black", markerfacecolor="none", markersize=size, label=text
             )
     if nodes.free.any():
-        label = f"calibrated, {probability:.0%} ellipse"
-        keys += ax.plot(*calibrated[nodes.free].T, ".", color="black", markersize=6, zorder=6, label=label)
+        label, times = f"calibrated, {probability:.0%} ellipse", _magnified(ax, nodes)
+        if times > 1:
+            label = f"shift and {probability:.0%} ellipse \N{MULTIPLICATION SIGN} {times:g}"
+        ends = stated + times * (calibrated - stated)
+        keys += ax.plot(*ends[nodes.free].T, ".", color="black", markersize=6, zorder=6, label=label)
         for k in np.flatnonzero(nodes.free):
-            _draw_shift(ax, stated[k], calibrated[k], nodes.covariance[k, :2, :2], probability)
+            _draw_shift(ax, stated[k], ends[k], times**2 * nodes.covariance[k, :2, :2], probability)
     name_places(ax, nodes.name, nodes.named[:, :2])
     return keys + _draw_headings(ax, nodes)
+
+
+def _magnified(ax: Axes, nodes: Places) -> float:
+    """The factor 1, 2, 5, 10, ... by which displacements are enlarged, as weak directions are."""
+    shift = np.linalg.norm((nodes.calibrated - nodes.stated)[nodes.free, :2], axis=1)
+    sd = np.sqrt(np.diagonal(nodes.covariance[nodes.free, :2, :2], axis1=1, axis2=2).max(1))
+    clear = shift > 2.0 * sd
+    times = REACH * np.ptp(ax.get_xlim()) / max(np.nanmax(np.maximum(shift, 2.0 * sd), initial=0.0), 1e-300)
+    if not clear.any() or times < 2.0:  # no node moved for sure, or far enough to be seen
+        return 1.0
+    whole = 10.0 ** np.floor(np.log10(times))
+    return float(max(step for step in (1.0, 2.0, 5.0) if step * whole <= times) * whole)
 
 
 def _draw_shift(ax: Axes, start: np.ndarray, end: np.ndarray, covariance: np.ndarray, probability: float) -> None:

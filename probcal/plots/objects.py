@@ -11,8 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from probcal.errors import InputError
 from probcal.plots.base import ALL_POINTS, LISTED, SURE, colour, finish, plain_text
-
-THERE = 0.5  # existence from which an object is counted
+from probcal.plots.scene import THERE
 
 
 def plot_objects(tree: xr.DataTree, axes: Sequence[Axes] | None = None) -> list[Axes]:

@@ -1,6 +1,5 @@
 """Pictures of what data can determine: spectrum of the information, weak directions and next passes on the map."""
 
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -11,12 +10,23 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from probcal.files import AnyPath
 from probcal.labels import label_parts
-from probcal.plots.base import BEFORE, GAMMA, NAMED, colour, finish, name_places, new_axes, plain_text, write_figure
+from probcal.plots.base import (
+    BEFORE,
+    GAMMA,
+    NAMED,
+    REACH,
+    colour,
+    finish,
+    name_places,
+    new_axes,
+    plain_text,
+    write_figure,
+)
 from probcal.plots.bounds import plot_bound_map
 from probcal.results.read import each_target
 
-REACH = 0.12  # longest arrow of a direction, in widths of the map
 SHOWN = 6  # directions on one map
 LOWEST = 1e-10  # information below which the spectrum is cut
 
@@ -74,7 +84,7 @@ def plot_passes(tree: xr.DataTree, passes: xr.Dataset, ax: Axes | None = None) -
     return finish(ax, "What one more pass would tell about the biases", grid="", key=False)
 
 
-def draw_check(tree: xr.DataTree, passes: xr.Dataset, bound: xr.Dataset, path: str | PathLike[str]) -> None:
+def draw_check(tree: xr.DataTree, passes: xr.Dataset, bound: xr.Dataset, path: AnyPath) -> None:
     """Write the pictures of a check to one file: directions, spectrum, next passes, map of the position bound."""
     figure = Figure(figsize=(15.0, 12.0), layout="constrained")
     parts: Any = figure.subfigures(2, 1, height_ratios=[1.1, 1.0])

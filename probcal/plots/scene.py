@@ -18,9 +18,9 @@ from probcal.results.read import bias_values, each_object, each_target
 from probcal.results.schema import DIFFERENT
 
 ARC = 48  # corners of a sector's arc
+THERE = 0.5  # existence from which an object is counted
 SEEN = 0.5  # share of an object in view at which the outline of a view is drawn
 ASIDE = 0.25  # of the extent of nodes and tracks up to which views and faint objects widen the map
-SURE = 0.5  # existence from which an object widens it at all
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def scene(tree: xr.DataTree) -> Scene:
     objects = [Found(name, *rest) for name, *rest in each_object(tree, AXES[: nodes.stated.shape[1]])]
     low, high = _limits(nodes, [*tracks, *mirrored], diverged=tree.attrs.get("status") == "diverged")
     views = list(_views(tree, nodes, float(np.linalg.norm(high - low))))
-    sure = [own.position[own.existence >= SURE] for own in objects]
+    sure = [own.position[own.existence >= THERE] for own in objects]
     low, high = _widened(low, high, sure, [*elsewhere, *(line for own in views for line in own.lines)])
     return Scene(nodes, tracks, mirrored, elsewhere, objects, views, low, high, frame)
 

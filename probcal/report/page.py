@@ -3,7 +3,6 @@
 import base64
 import io
 import json
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from matplotlib.axes import Axes
 
 from probcal import plots
 from probcal.errors import InputError
-from probcal.files import write_whole
+from probcal.files import AnyPath, write_whole
 from probcal.plots.base import figure_of
 from probcal.report import tables, words
 from probcal.results.drifts import drift_table
@@ -44,7 +43,7 @@ PICTURES = {
 }  # fmt: skip
 
 
-def write_report(tree: xr.DataTree, path: str | PathLike[str], *, static: bool = False) -> Path:
+def write_report(tree: xr.DataTree, path: AnyPath, *, static: bool = False) -> Path:
     """Write the report of a fit as one HTML file that needs nothing else; a file of that name is whole or absent.
 
     `static` leaves the interactive map, and with it every script, out. Raises `InputError` if the file cannot be
@@ -89,6 +88,7 @@ def _render(tree: xr.DataTree, static: bool) -> str:
         colour="warn" if found == "good" and words.in_conflict(tree) else found,
         invalid=attrs["status"] in INVALID,
         headline=words.headline(tree),
+        further=[text for text in (words.left_open(tree), words.next_step(tree)) if text],
         errors=words.position_errors(attrs),
         probability=f"{float(attrs.get('interval_probability', plots.INTERVAL)):.0%}",
         chart=chart,

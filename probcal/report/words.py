@@ -9,7 +9,10 @@ import numpy as np
 import xarray as xr
 from markupsafe import Markup, escape
 
+from probcal.analysis.findings import LAST
+from probcal.labels import listed
 from probcal.results.read import known_truth, listed_in, summary
+from probcal.results.schema import VERDICTS
 from probcal.status import INVALID, Status
 
 NONE = "–"  # where there is no finite number
@@ -81,10 +84,34 @@ def headline(tree: xr.DataTree) -> str:
     return f"The fit {status.said}: {told}{_judged(tree)}."
 
 
+def left_open(tree: xr.DataTree) -> str:
+    """One sentence on what the data do not tell alone; empty where nothing was assessed."""
+    pairs = zip(*(listed_in(tree, "verdict", name) for name in ("bias_label", "verdict")), strict=True)
+    every, known = dict(pairs), ("determined", *ASIDE)
+    if not every or not Status(tree.attrs["status"]).settled:
+        return ""
+    own = [name for name in every if every[name] not in known]
+    ways = listed_in(tree, "direction", "direction")
+    told = f"The data alone do not tell {len(own)} of {len(every)} biases: {listed(own)}"
+    return f"{told if own else 'The data tell every bias'}{f'; left open: {listed(ways, 2)}' if ways else ''}."
+
+
+def next_step(tree: xr.DataTree) -> str:
+    """One sentence on what to look at first: a cause that a check names, else what is open."""
+    pairs = zip(listed_in(tree, "finding", "kind"), listed_in(tree, "finding", "sentence"), strict=True)
+    if cause := next((sentence for kind, sentence in pairs if kind not in LAST), ""):
+        return f"To look at first: {cause}."
+    if not listed_in(tree, "verdict", "verdict"):
+        return ""
+    columns = (listed_in(tree, "direction", name) for name in ("information", "direction", "remedy"))
+    _, name, remedy = min(zip(*columns, strict=True), default=(0.0, "", ""))
+    return f"To tell {name}: {remedy}." if remedy else "No check asks for a change of the model."
+
+
 def _judged(tree: xr.DataTree) -> str:
     """How many biases have which verdict."""
     count = Counter(listed_in(tree, "verdict", "verdict"))
-    known = dict.fromkeys(("determined", *ASIDE, "weak", "prior only", *sorted(count)))
+    known = dict.fromkeys((*VERDICTS, *sorted(count)))
     told = [f"{count[name]} {name}" for name in known if count[name]]
     return f"; {', '.join(told)}" if told else ""
 

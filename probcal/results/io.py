@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from probcal.errors import InputError, checked
-from probcal.files import write_whole
+from probcal.files import AnyPath, write_whole
 from probcal.lazy import xr
 from probcal.results.accessor import register
 from probcal.results.blocks import SensorBlocks
@@ -37,7 +37,7 @@ LOSS = 1e-6
 
 
 @checked
-def save(tree: xr.DataTree, path: str | PathLike[str]) -> Path:
+def save(tree: xr.DataTree, path: AnyPath) -> Path:
     """Write netCDF in one step, compressed and with checksums: a file of that name is whole or absent.
 
     Raises `InputError` where it cannot be written.
@@ -67,7 +67,7 @@ def _is_text(variable: xr.Variable) -> bool:
     return variable.dtype.kind in "UO" and all(isinstance(value, str) for value in variable.values.ravel())
 
 
-def load(path: str | PathLike[str]) -> xr.DataTree:
+def load(path: AnyPath) -> xr.DataTree:
     """Read a fit back from its file, or from the folder that holds `fit.nc`.
 
     Raises `InputError` where the file is damaged, foreign, or written by another version.

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probcal.errors import InputError, checked
+from probcal.files import AnyPath
 from probcal.labels import NOBODY
 from probcal.lazy import pd, xr
 from probcal.results.blocks import SensorBlocks
@@ -167,7 +168,7 @@ def held_by(calibration: xr.DataTree, labels: Sequence[str]) -> dict[str, float]
 
 
 @checked
-def with_calibration(network: Network, source: xr.DataTree | str | PathLike[str]) -> Network:
+def with_calibration(network: Network, source: xr.DataTree | AnyPath) -> Network:
     """The network with the values and sds that a fit found, in the place of those that it states.
 
     Parameters

@@ -22,6 +22,7 @@ import numpy as np
 from probcal.errors import InputError
 
 INTERVAL = 0.89  # probability of lower to upper
+VERDICTS = "determined", "relative", "conflicting", "drifting", "by the prior", "weak", "prior only"
 # of what a fit writes; a reader takes files of version 3 too and refuses any other
 RESULTS_VERSION = 4
 MORE = ("r_hat", "ess", "ess_tail", "inclusion", "included", "contraction")  # columns of samplers

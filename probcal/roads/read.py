@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.files import parsed_json
+from probcal.files import AnyPath, parsed_json
 from probcal.geodesy import LocalFrame
 from probcal.roads.checks import as_points
 from probcal.roads.coordinates import WGS84, projection
@@ -20,7 +19,7 @@ from probcal.roads.network import RoadNetwork, joined
 
 
 def read_roads(
-    path: str | PathLike[str],
+    path: AnyPath,
     *,
     frame: LocalFrame | None = None,
     crs: Any = None,

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
 from probcal.errors import InputError
+from probcal.files import AnyPath
 from probcal.lazy import pd
 
 ORDER = 4  # of the Butterworth band-pass, run forwards and backwards
 QUIET = 1e-30  # mean square below which a window holds nothing
 
 
-def read_wav(path: str | PathLike[str]) -> tuple[np.ndarray, float]:
+def read_wav(path: AnyPath) -> tuple[np.ndarray, float]:
     """Samples (N, channels) of a WAV file, whole numbers scaled to [-1, 1), and their rate in Hz.
 
     Raises `InputError` naming the file where it is missing, is no WAV file or holds nothing.

@@ -1,11 +1,11 @@
 """Rows for those who listened and heard nothing, where a log holds only what was heard."""
 
 from collections.abc import Sequence
-from os import PathLike
 
 import numpy as np
 
 from probcal.errors import InputError, nearest
+from probcal.files import AnyPath
 from probcal.lazy import pd
 from probcal.network import Network
 from probcal.noise import Censored
@@ -13,7 +13,7 @@ from probcal.table import read_table
 
 
 def with_silence(
-    data: "str | PathLike[str] | pd.DataFrame", network: Network, *, listens: Sequence[str] | None = None
+    data: "AnyPath | pd.DataFrame", network: Network, *, listens: Sequence[str] | None = None
 ) -> "pd.DataFrame":
     """The table with a row, its channels blank, for each receiver that was silent when another heard the same target.
 

@@ -12,14 +12,13 @@ import itertools
 import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from probcal.errors import InputError
-from probcal.files import cannot_write
+from probcal.files import AnyPath, cannot_write
 from probcal.inference.manifest import MARK, OVERWRITE, STORE, clear_store, store_mark
 from probcal.inference.storage import Storage
 from probcal.lazy import Later, xr
@@ -221,7 +220,7 @@ def open_fits(storage: Storage, axes: Mapping[str, list[Any]], methods: Sequence
     return Fits(layout, stored.words, arrays, path, storage.digest)
 
 
-def load_study(path: str | PathLike[str]) -> xr.Dataset:
+def load_study(path: AnyPath) -> xr.Dataset:
     """Read the finished fits of a study from its `store`, or from the --out of `probcal study`, while it runs too.
 
     The Dataset is that of `study`; fits that are not finished are NaN, with an empty `status`. Raises `InputError`

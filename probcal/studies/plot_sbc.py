@@ -1,7 +1,6 @@
 """Pictures of a simulation-based calibration: ranks against their simultaneous band, coverage of the intervals."""
 
 from collections.abc import Sequence
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
 from probcal.errors import InputError, nearest
+from probcal.files import AnyPath
 from probcal.plots.base import BEFORE, colour, new_axes, plain_text, write_figure
 from probcal.studies.uniformity import band
 
@@ -99,7 +99,7 @@ def plot_coverage(tree: xr.DataTree, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def draw_sbc(tree: xr.DataTree, path: str | PathLike[str]) -> None:
+def draw_sbc(tree: xr.DataTree, path: AnyPath) -> None:
     """Write ranks and coverage of a calibration as one picture."""
     rows = -(-min(tree["sbc"].sizes["quantity"], PANELS) // COLUMNS)
     figure = Figure(figsize=(WIDTH, HEIGHT * (rows + 2)), layout="constrained")

@@ -1,7 +1,6 @@
 """Pictures of a study."""
 
 from collections.abc import Sequence
-from os import PathLike
 
 import numpy as np
 import xarray as xr
@@ -9,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from probcal.errors import InputError
+from probcal.files import AnyPath
 from probcal.plots.base import colour, plain_text, write_figure
 
 
@@ -45,7 +45,7 @@ def plot_study(study: xr.Dataset, variable: str = "bias_rmse", axes: Sequence[Ax
     return list(axes)
 
 
-def draw_study(study: xr.Dataset, path: str | PathLike[str]) -> None:
+def draw_study(study: xr.Dataset, path: AnyPath) -> None:
     """Write the picture of a study to a file."""
     figure = plot_study(study)[0].get_figure(root=True)
     assert isinstance(figure, Figure)

@@ -7,7 +7,6 @@ and what is checked is the method where it will be used. It is the right tool wh
 target whose start is not declared would pass many network sizes away.
 """
 
-import os
 import time
 from collections.abc import Sequence
 from contextlib import closing
@@ -21,6 +20,7 @@ import numpy as np
 import xarray as xr
 
 from probcal.errors import FitError, InputError
+from probcal.files import AnyPath
 from probcal.gaussian.information import at_levels
 from probcal.gaussian.mode import Point, find_mode
 from probcal.inference.hierarchy import hierarchy_of
@@ -63,7 +63,7 @@ def sbc(
     start: str = "automatic",
     key: Key = 0,
     draws: int = 100,
-    store: str | os.PathLike[str] | None = None,
+    store: AnyPath | None = None,
     resume: bool = False,
     overwrite: bool = False,
     fallback: bool = True,

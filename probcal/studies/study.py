@@ -4,7 +4,6 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from functools import partial
-from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ import xarray as xr
 
 from probcal.devices import over_devices
 from probcal.errors import InputError, nearest
+from probcal.files import AnyPath
 from probcal.gaussian.mode import Point
 from probcal.inference.ending import conclude
 from probcal.inference.identity import identity, problem_digest
@@ -289,7 +289,7 @@ def study(
     methods: Sequence[str] | Mapping[str, Any] = ("ml", "em-ea", "ea", ORACLE),
     *,
     runs: int | Sequence[int] = 20,
-    store: str | PathLike[str] | None = None,
+    store: AnyPath | None = None,
     resume: bool = False,
     overwrite: bool = False,
     scheduler: Any = None,
