@@ -14,6 +14,7 @@ from probcal.analysis.outliers import check_outliers
 from probcal.analysis.parts import check_parts
 from probcal.analysis.process import check_process
 from probcal.analysis.recoded import check_recoded
+from probcal.analysis.ridges import check_ridges
 from probcal.analysis.rows import check_rows
 from probcal.analysis.scaling import check_scaling
 from probcal.analysis.segments import check_segments
@@ -36,6 +37,7 @@ CHECKS: dict[str, Check] = {
     "segments": check_segments,
     "slopes": check_slopes,
     "shape": check_shape,
+    "ridges": check_ridges,
     "mirrors": check_mirrors,
     "lags": check_lags,
     "scaling": check_scaling,

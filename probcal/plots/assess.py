@@ -28,9 +28,9 @@ from probcal.results.read import each_track
 
 # the words of a verdict, each with its colour and mark
 VERDICTS = {
-    "determined": (COLOURS[2], "o"), "relative": (SURE, "D"), "by the prior": (FAINT, "p"),
-    "weak": (COLOURS[4], "s"), "prior only": ("#8c8c8c", "v"),
-    "drifting": (COLOURS[1], "^"), "conflicting": (COLOURS[3], "X"),
+    "determined": ("#009e73", "o"), "relative": (SURE, "D"), "by the prior": (FAINT, "p"),
+    "weak": ("#e69f00", "s"), "prior only": ("#8c8c8c", "v"),
+    "drifting": ("#d55e00", "^"), "conflicting": ("#cc79a7", "X"),
 }  # fmt: skip
 
 
