@@ -9,7 +9,7 @@ import worlds
 import probcal
 from probcal import Bias, Channel, ConstantVelocity, Network, Node, Problem, RandomWalk, Target, sensor
 from probcal.analysis.check import Case
-from probcal.analysis.ridges import check_ridges, ways
+from probcal.analysis.ridges import check_ridges, moved_together
 from probcal.inference.fitted import take_up
 from probcal.types import float64
 
@@ -64,8 +64,8 @@ def test_a_linear_problem_falls_as_a_gaussian():
 
     @float64
     def falls():
-        fit = take_up(problem, tree)
-        return [way.held(4.0, way.mode.at.moved(4.0 / way.sd * way.response))[1] for way, _ in ways(fit, told=1.0)]
+        ways = (way for way, _ in moved_together(take_up(problem, tree), told=1.0))
+        return [way.held(4.0, way.mode.at.moved(4.0 / way.sd * way.response))[1] for way in ways]
 
     found = falls()
     assert len(found) >= 2

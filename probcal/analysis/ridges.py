@@ -71,7 +71,7 @@ class Way(NamedTuple):
         return end, fall, away
 
 
-def combinations(problem: Problem) -> Iterator[tuple[str, np.ndarray]]:
+def of_components(problem: Problem) -> Iterator[tuple[str, np.ndarray]]:
     """Unit vectors (M,) of the biases of each component that several nodes or sensors have."""
     parts = np.array([label.partition(".")[2] for label in problem.labels])
     for name in dict.fromkeys(parts[~problem.surveyed].tolist()):
@@ -80,10 +80,10 @@ def combinations(problem: Problem) -> Iterator[tuple[str, np.ndarray]]:
             yield name, mine / np.sqrt(mine.sum())
 
 
-def ways(fit: Judged, told: float = TOLD) -> Iterator[tuple[Way, Point]]:
+def moved_together(fit: Judged, told: float = TOLD) -> Iterator[tuple[Way, Point]]:
     """Each component that the data seem to tell to `told` prior sds, and tracks an sd aside."""
     problem, expand = fit.problem, partial(fit.engine.settled, fit.problem.model)
-    factors, asked = Factors.of(problem.first_precision(Gaussian())), dict(combinations(problem))
+    factors, asked = Factors.of(problem.first_precision(Gaussian())), dict(of_components(problem))
     if not asked:
         return
     mode = climb_to_mode(expand, fit.point, factors, CLIMB, CLOSE)
@@ -105,7 +105,7 @@ def check_ridges(case: Case) -> Checked:
     """
     fit, findings, doubts = case.fit, list[Finding](), dict[int, str]()
     problem, sd = fit.problem, case.tree["calibration"].to_dataset()["sd"].values
-    for way, near in ways(fit) if fit.engine.cheap else ():
+    for way, near in moved_together(fit) if fit.engine.cheap else ():
         found = way.end(-1.0, near) or way.end(1.0, near)
         if found is None:
             continue
