@@ -8,7 +8,16 @@ import xarray as xr
 from probcal.analysis.check import Case, Checked
 from probcal.analysis.checks import CHECKS
 from probcal.analysis.findings import Finding, alarms, finding_group, in_order
-from probcal.analysis.verdict import RATE, Grounds, explained_part, gaussian_interval, judge_biases, limit_of, pull
+from probcal.analysis.verdict import (
+    PART,
+    RATE,
+    Grounds,
+    explained_part,
+    gaussian_interval,
+    judge_biases,
+    limit_of,
+    pull,
+)
 from probcal.inference.fitted import take_up
 from probcal.inference.widen import said, sentence, unwidened, widened
 from probcal.problem import Problem
@@ -91,6 +100,7 @@ def _verdicts(case: Case, found: list[Checked]) -> xr.Dataset:
     wide = np.maximum(inflation, 1.0) if case.rejected.reason else 1.0  # as the fit is widened
     gaussian = gaussian_interval(case.declared_mean, sd * np.sqrt(1.0 + narrowed * (wide - 1.0)))
     sharper, limit = group["sd"].values / (problem.scales * sd), float(np.sqrt(limit_of(len(z))))
+    sharper = np.where(1.0 - gamma < PART, 1.0, sharper)  # what its own prior hardly gives
     known = Grounds(narrowed, pull(z, alpha, gamma, inflation), limit, part, gaussian, sharper)
     doubts = {word: dict(ChainMap(*(dict(own.doubts.get(word, {})) for own in reversed(found)))) for word in VERDICTS}
     remarks = {m: text for own in found for m, text in own.remarks.items()}

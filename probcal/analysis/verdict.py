@@ -23,7 +23,8 @@ weak         s < 0.5 (information below 1), or one scale along a combination of 
              (misfit)
 relative     clearly away from zero, as the prior shares out a combination of biases that the data
              leave open: it stands apart from the others of that, all of which may be off together
-by the prior its sd is less than half of what a Gaussian prior of its scale leaves: sparsity decides
+by the prior its sd is less than half of what a Gaussian prior of its scale leaves, and its prior gives a
+             tenth of it or more: sparsity decides
 determined   none of these
 
 Limits have a false-alarm rate of 1 % over all biases together, and the standard deviations behind them carry the
@@ -44,7 +45,8 @@ from probcal.status import Status
 
 RATE = 0.01  # false alarms of each kind of check, all its comparisons together
 PRIOR_ONLY, WEAK = 0.05, 0.5
-# share of the chi-square of the innovations above its mean from which a bias is one of its causes
+# share of the chi-square of the innovations above its mean from which a bias is one of its causes,
+# and of an answer from which its prior counts
 PART = 0.1
 # sd of a bias, in that under a Gaussian prior of its scale, below which sparsity decides
 SHARP = 0.5
@@ -63,7 +65,7 @@ class Grounds(NamedTuple):
     part: Any = 1.0
     # lower and upper end of the interval that a Gaussian prior of the declared scale leaves
     gaussian: Any = (0.0, 0.0)
-    sharper: Any = 1.0  # sd of the fit in the one that such a prior leaves
+    sharper: Any = 1.0  # sd of the fit in that of such a prior, where the own prior counts
 
 
 def gaussian_interval(mean: np.ndarray, sd: np.ndarray) -> np.ndarray:
