@@ -176,7 +176,7 @@ CASES |= RECORDINGS
 
 
 def one(case, run):
-    """What one run says, as plain data: lists of its biases; of its tracks the count beyond 0, 2, 3 and 4 sd."""
+    """One run as plain data: lists of its biases; counts of the coordinates of its tracks, as `beyond`."""
     problem, truth = CASES[case](run)
     said = {"case": case, "run": run}
     try:
@@ -203,7 +203,7 @@ def one(case, run):
 
 
 def positions_off(tree, truth):
-    """How many sd each coordinate of each position lies off."""
+    """Error of each coordinate of each position, in sd."""
     off = [np.zeros(0)]
     for name, track in each_track(tree):
         axes = coordinates(track["component"].values.tolist())
@@ -216,7 +216,7 @@ def positions_off(tree, truth):
 
 
 def beyond(off):
-    """How many lie off at all, and by more than 2, 3 and 4 sd."""
+    """Number of errors, and of those above 2, 3 and 4 sd."""
     return np.array([np.isfinite(off).sum(), *((off > sd).sum() for sd in DISTANCES)])
 
 
@@ -253,7 +253,7 @@ def row_of_words(case, runs):
 
 
 def row_of_reliability(case, runs):
-    """How much of what is called determined, and of the tracks of settled fits, lies within 2, 3 and 4 sd."""
+    """Share of what is called determined, and of the tracks of settled fits, within 2, 3 and 4 sd of the truth."""
     off, word = columns(runs, "off", "word")
     biases = beyond(off[word == "determined"])
     tracks = np.sum([run["tracks"] for run in runs if run["status"] in SETTLED] or [np.zeros(4, int)], 0)

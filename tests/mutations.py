@@ -36,6 +36,9 @@ MUTATIONS = [
     Mutation("expected = max(expected, float(usual))", "pass", "test_labels.py"),
     Mutation("moved[place[b]] -= apart", "moved[place[b]] += apart", "test_labels.py"),
     Mutation("2.0 * float(special.stdtr(df, -np.sqrt(df)))", "float(special.stdtr(df, -np.sqrt(df)))", "test_labels.py"),
+    # analysis/ridges.py, analysis/check.py
+    Mutation("if not fall < FLAT * 0.5", "if not fall < -FLAT * 0.5", "test_ridges.py"),
+    Mutation("at.score()) - z", "at.slope()) - z", "test_ridges.py"),
     # analysis/slopes.py, analysis/recoded.py
     Mutation("if not gain > CONFIRMED * expected:", "if not gain > 1e9:", "test_slopes.py"),
     Mutation("(inverse[k] - np.diag(held[members]))[np.ix_", "inverse[k][np.ix_", "test_slopes.py"),

@@ -1,4 +1,4 @@
-"""What looks well told at the mode and is open along a curve: anchors near one plane, a tag beside it."""
+"""Biases that look well told at the mode and are open along a curve: anchors near one plane, a tag above it."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -47,7 +47,7 @@ def checked(problem, tree):
 
 @pytest.mark.ci
 def test_offsets_that_trade_with_a_height_are_not_determined(flat):
-    """They are off at the plane; the ridge is named, followed to where the truth lies, and they are weak."""
+    """They are off at the plane; the ridge is named and followed beyond the truth, and they are in doubt."""
     problem, tree = flat
     off = (tree["calibration"]["mean"].values - OFFSETS) / tree["calibration"]["sd"].values
     assert off.min() > 2.0
@@ -56,6 +56,15 @@ def test_offsets_that_trade_with_a_height_are_not_determined(flat):
     (ridge,) = found.findings
     assert ridge.sentence.startswith("range_offset of a0, a1, a2, a3 may be off together by -0.1 m and more")
     assert sorted(found.doubts["weak"]) == [0, 1, 2, 3]
+
+
+@pytest.mark.ci
+def test_the_mean_under_a_gaussian_prior_counts_the_volume_of_the_tracks(flat):
+    """At the mode under that prior it is the mode; the slope without the volume leads elsewhere."""
+    problem, tree = flat
+    found = tree["calibration"].to_dataset()
+    mean = float64(lambda: Case(take_up(problem, tree), tree, None, []).declared_mean)()
+    assert np.abs(mean * problem.scales - found["mean"].values).max() < 0.05 * found["sd"].values.min()
 
 
 @pytest.mark.ci

@@ -16,6 +16,7 @@ import numpy as np
 from probcal.analysis.check import Case, Checked, check
 from probcal.analysis.findings import Finding
 from probcal.analysis.pieces import HELD
+from probcal.analysis.verdict import in_unit
 from probcal.gaussian.climb import Climbed, climb_to_mode
 from probcal.gaussian.engine import Expansion, Factors, Group
 from probcal.gaussian.information import at_levels
@@ -72,18 +73,19 @@ class Way(NamedTuple):
 
 
 def of_components(problem: Problem) -> Iterator[tuple[str, np.ndarray]]:
-    """Unit vectors (M,) of the biases of each component that several nodes or sensors have."""
-    parts = np.array([label.partition(".")[2] for label in problem.labels])
-    for name in dict.fromkeys(parts[~problem.surveyed].tolist()):
-        mine = (parts == name) & ~problem.surveyed
+    """Unit vectors (M,) of the biases of one name and unit that several nodes or sensors have."""
+    pairs = zip(problem.labels, problem.biases, strict=True)
+    parts = [(label.partition(".")[2], bias.unit) for label, bias in pairs]
+    for part in dict.fromkeys(parts):
+        mine = np.array([own == part for own in parts]) & ~problem.surveyed
         if mine.sum() > 1:
-            yield name, mine / np.sqrt(mine.sum())
+            yield part[0], mine / np.sqrt(mine.sum())
 
 
 def moved_together(fit: Judged, told: float = TOLD) -> Iterator[tuple[Way, Point]]:
     """Each component that the data seem to tell to `told` prior sds, and tracks an sd aside."""
     problem, expand = fit.problem, partial(fit.engine.settled, fit.problem.model)
-    factors, asked = Factors.of(problem.first_precision(Gaussian())), dict(of_components(problem))
+    factors, asked = Factors.of(problem.first_precision(Gaussian())), list(of_components(problem))
     if not asked:
         return
     mode = climb_to_mode(expand, fit.point, factors, CLIMB, CLOSE)
@@ -91,7 +93,7 @@ def moved_together(fit: Judged, told: float = TOLD) -> Iterator[tuple[Way, Point
     pairs = zip(map(np.asarray, point.states), spread, strict=True)
     aside = [x + np.sqrt(np.diagonal(own, axis1=1, axis2=2)) for x, own in pairs]
     near = at_levels(problem.model, follow_states(problem, aside), point.levels)
-    for name, along in asked.items():
+    for name, along in asked:
         way = Way(name, along, expand, factors, mode, np.asarray(mode.at.solve(factors, along)))
         if way.sd < told:
             yield way, near
@@ -113,7 +115,7 @@ def check_ridges(case: Case) -> Checked:
         shift = (np.asarray(end.at.point.z) - np.asarray(way.mode.at.point.z)) * problem.scales
         mine = np.flatnonzero(way.along)
         owners = listed([problem.labels[m].partition(".")[0] for m in mine])
-        off = f"{np.mean(shift[mine]):.2g} {problem.biases[mine[0]].unit} and more"
+        off = f"{in_unit(np.mean(shift[mine]), problem.biases[mine[0]].unit)} and more"
         text = (
             f"{way.name} of {owners} may be off together by {off}: the density falls by {fall:.2g}"
             f" nats there, that of a Gaussian by {0.5 * away**2:.2g}. Something else moves along, a"

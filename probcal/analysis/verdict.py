@@ -123,14 +123,16 @@ def judge_biases(
     numbers = (known.part, known.sharper, *known.gaussian)
     explained, sharper, lower, upper = (np.broadcast_to(own, len(problem.biases)) for own in numbers)
     for m, bias in enumerate(problem.biases):
-        s, unit = known.contraction[m], bias.unit if bias.unit != "1" else ""
+        s, unit = known.contraction[m], bias.unit
         declared = bias.kind
-        sizes = f"{declared} of {_size(bias.scale, unit)} to {_size(bias.scale * np.sqrt(1 - s), unit)}"
+        sizes = f"{declared} of {in_unit(bias.scale, unit)} to {in_unit(bias.scale * np.sqrt(1 - s), unit)}"
         information = f"information {s / max(1 - s, 1e-12):.2g}"
-        beyond = f"{known.pull[m]:.1f} sd beyond its {declared} of {_size(bias.scale, unit)} (limit {known.limit:.1f})"
+        beyond = (
+            f"{known.pull[m]:.1f} sd beyond its {declared} of {in_unit(bias.scale, unit)} (limit {known.limit:.1f})"
+        )
         far, part = known.pull[m] > known.limit, explained[m]
         sharp = sharper[m] < SHARP
-        left = f"{lower[m] * bias.scale:.2g} to {_size(upper[m] * bias.scale, unit)}"
+        left = f"{lower[m] * bias.scale:.2g} to {in_unit(upper[m] * bias.scale, unit)}"
         elsewhere = f"{beyond}, by a misfit elsewhere: it explains {part:.1g} of the excess of the innovations"
         cases = (  # the first that holds counts
             (not status.explains, "conflicting", "the fit ended misfit: model and data contradict each other"),
@@ -154,5 +156,6 @@ def judge_biases(
     return verdicts, sentences
 
 
-def _size(value: float, unit: str) -> str:
-    return f"{value:.2g} {unit}".strip()
+def in_unit(value: float, unit: str) -> str:
+    """A value with its unit, if it has one."""
+    return f"{value:.2g} {unit if unit != '1' else ''}".strip()

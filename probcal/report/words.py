@@ -87,7 +87,7 @@ def headline(tree: xr.DataTree) -> str:
 def left_open(tree: xr.DataTree) -> str:
     """One sentence on what the data do not tell alone; empty where nothing was assessed."""
     pairs = zip(*(listed_in(tree, "verdict", name) for name in ("bias_label", "verdict")), strict=True)
-    every, known = dict(pairs), VERDICTS[:4]
+    every, known = dict(pairs), ("determined", "relative", *ASIDE)
     if not every or not Status(tree.attrs["status"]).settled:
         return ""
     own = [name for name in every if every[name] not in known]
