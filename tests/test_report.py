@@ -424,6 +424,8 @@ def test_small_displacements_are_drawn_at_a_scale_that_the_legend_names():
     (ellipse,) = [patch for patch in ax.patches if isinstance(patch, Ellipse)]
     np.testing.assert_allclose(ellipse.center, tree["constant_data"]["node_position"].values[0] + times * shift)
     assert 0.04 < times * 0.4 / np.ptp(ax.get_xlim()) <= 0.12
+    (left, right), reach = ax.get_xlim(), 0.5 * ellipse.width
+    assert left < ellipse.center[0] - reach < ellipse.center[0] + reach < right
     tree["calibration"]["covariance"][:2, :2] = np.eye(2)
     assert not any("shift and" in text.get_text() for text in plots.plot_map(tree).get_legend().get_texts())
 

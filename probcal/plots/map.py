@@ -129,6 +129,8 @@ def _draw_nodes(ax: Axes, nodes: Places, probability: float) -> list[Line2D]:
         label, times = f"calibrated, {probability:.0%} ellipse", _magnified(ax, nodes)
         if times > 1:
             label = f"shift and {probability:.0%} ellipse \N{MULTIPLICATION SIGN} {times:g}"
+            room = REACH * np.ptp(ax.get_xlim()) * np.array([-1.0, 1.0])
+            ax.set(xlim=ax.get_xlim() + room, ylim=ax.get_ylim() + room)
         ends = stated + times * (calibrated - stated)
         keys += ax.plot(*ends[nodes.free].T, ".", color="black", markersize=6, zorder=6, label=label)
         for k in np.flatnonzero(nodes.free):
