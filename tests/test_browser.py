@@ -146,6 +146,7 @@ def test_the_wheel_zooms_with_ctrl_and_scrolls_without(browser, pages):
 
 def words_at(browser, source):
     """What the map says where the pointer is on the first entry of a source that has these columns."""
+    browser.execute_script("document.getElementById('map').scrollIntoView({block: 'center'})")
     place = browser.execute_script(
         f"""const plan = {PLAN}, view = Bokeh.index.find_one(plan), box = view.canvas_view.el.getBoundingClientRect();
         const frame = view.frame, sources = plan.renderers.map((r) => r.data_source);

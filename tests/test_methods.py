@@ -24,6 +24,7 @@ from probcal.inference import METHODS, table
 from probcal.inference.method import Context
 from probcal.inference.methods import choose_prior
 from probcal.inference.sampler import Sampler
+from probcal.model import sigma
 from probcal.model.model import At
 from probcal.noise import AdditiveNoise, Normal
 from probcal.priors import PRIORS, Precision, Prior
@@ -182,6 +183,14 @@ def test_sigma_points_change_nothing_where_sensors_are_linear(name, rule):
     methods = [EM(step, iterations=40, tolerance=0.0) for step in (Extended(), rule)]
     found = [probcal.fit(problem, method, start=resting(problem))["calibration"]["mean"].values for method in methods]
     np.testing.assert_allclose(found[1], found[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("rule", [sigma.unscented, sigma.cubature])
+def test_sigma_points_do_not_turn_with_rounding(rule):
+    """Axes of equal variance: any eigenvectors are theirs, and two machines take others."""
+    covariance, crossed = 4e4 * np.eye(2), 1e-9 * (1.0 - np.eye(2))
+    found = [sigma.sigma_points(jnp.asarray(covariance + sign * crossed), rule) for sign in (-1.0, 0.0, 1.0)]
+    assert max(abs(points.shift - found[1].shift).max() for points in found) < 1e-9
 
 
 @pytest.mark.parametrize("rule", [Unscented(), Cubature()], ids=repr)

@@ -32,43 +32,52 @@ def cubature(entries: int) -> float:
     return 0.0
 
 
-class _Points(NamedTuple):
-    states: jax.Array  # (S, E, n), only the entries that the block reads are moved
+class PointSet(NamedTuple):
+    """Sigma points about means, each (..., u), by the symmetric root, which does not turn with rounding."""
+
+    shift: jax.Array  # (S, ..., u)
     unit: jax.Array  # (S, u) the same points for unit covariance
     weight: jax.Array  # (S,)
-    whiten: jax.Array  # (E, u, u) from state entries to unit covariance
+    whiten: jax.Array  # (..., u, u) from entries to unit covariance
 
 
-def _points(block: Block, states: jax.Array, covariance: jax.Array, rule: Rule) -> _Points:
-    used = np.asarray(block.used, int)
-    u = len(used)
+def sigma_points(covariance: jax.Array, rule: Rule) -> PointSet:
+    """The points of a rule for covariances (..., u, u)."""
+    u = covariance.shape[-1]
     kappa = rule(u)
     axes = np.concatenate([np.eye(u), -np.eye(u)]) * np.sqrt(u + kappa)
     unit = np.concatenate([np.zeros((1, u)), axes]) if kappa else axes
     centre = [kappa / (u + kappa)] if kappa else []
     weight = np.concatenate([centre, np.full(2 * u, 0.5 / (u + kappa))])
-    values, vectors = linalg.spectrum(covariance[:, used[:, None], used[None, :]])
-    root = jnp.sqrt(jnp.maximum(values, FLOOR))
-    shift = jnp.einsum("euv,ev,sv->seu", vectors, root, jnp.asarray(unit))
-    moved = jnp.broadcast_to(states, (len(weight), *states.shape)).at[:, :, used].add(shift)
-    return _Points(moved, jnp.asarray(unit), jnp.asarray(weight), vectors.mT / root[:, :, None])
+    values, vectors = linalg.spectrum(covariance)
+    scale = jnp.sqrt(jnp.maximum(values, FLOOR))[..., None, :]
+    root = (vectors * scale) @ vectors.mT
+    return PointSet(
+        jnp.einsum("...uv,sv->s...u", root, unit), jnp.asarray(unit), jnp.asarray(weight), vectors / scale @ vectors.mT
+    )
+
+
+def _points(block: Block, states: jax.Array, covariance: jax.Array, rule: Rule) -> tuple[jax.Array, PointSet]:
+    """States (S, E, n) with the entries moved that the block reads, and the points of these."""
+    used = np.asarray(block.used, int)
+    points = sigma_points(covariance[:, used[:, None], used[None, :]], rule)
+    moved = jnp.broadcast_to(states, (len(points.weight), *states.shape)).at[:, :, used].add(points.shift)
+    return moved, points
 
 
 def _block(block: Block, data: Rows, point: Where, states: jax.Array, covariance: jax.Array, rule: Rule) -> Linearised:
     if not block.used:
         return rows.linearise(block, data, states, point.z, point.levels, expected=False)
-    points = _points(block, states, covariance, rule)
+    at, points = _points(block, states, covariance, rule)
     centre = rows.predict(block, data, states, point.z)
-    values = jax.lax.map(lambda x: rows.predict(block, data, x, point.z), points.states)
+    values = jax.lax.map(lambda x: rows.predict(block, data, x, point.z), at)
     moved = rows.difference(block, values, centre[None])
     mean = jnp.einsum("s,snc->nc", points.weight, moved)
     slope = jnp.einsum("s,snc,su->ncu", points.weight, moved - mean[None], points.unit)
     left = jnp.einsum("s,snc->nc", points.weight, (moved - mean[None]) ** 2) - jnp.sum(slope**2, -1)
     extra = jnp.maximum(left, 0.0)
     score, weight = rows.weigh(block, data, centre + mean, point.levels, expected=False, extra=extra)
-    by_bias = jax.lax.map(
-        lambda x: rows.linearise(block, data, x, point.z, point.levels, expected=False).bias, points.states
-    )
+    by_bias = jax.lax.map(lambda x: rows.linearise(block, data, x, point.z, point.levels, expected=False).bias, at)
     by_state = jnp.einsum("ncu,nuv->ncv", slope, points.whiten[data.epoch])
     return Linearised(score, weight, by_state, jnp.einsum("s,sncp->ncp", points.weight, by_bias))
 
@@ -92,8 +101,8 @@ def expect_biases(model: Model, point: Where, covariances: Sequence[jax.Array], 
         if not block.used:
             G, g = at(point.states[r])
         else:
-            points = _points(block, point.states[r], covariances[r], rule)
-            each = jax.lax.map(at, points.states)
+            states, points = _points(block, point.states[r], covariances[r], rule)
+            each = jax.lax.map(at, states)
             G, g = (jnp.einsum("s,s...->...", points.weight, part) for part in each)
         information.append(G)
         score = score + g

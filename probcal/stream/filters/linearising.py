@@ -6,12 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from probcal import linalg
 from probcal.model import rows as waist
 from probcal.model.epochs import Epoch
 from probcal.model.model import Model
 from probcal.model.rows import Block, Linearised, Rows
-from probcal.model.sigma import FLOOR, Rule
+from probcal.model.sigma import Rule, sigma_points
 from probcal.noise import gate_limits
 from probcal.stream.filters.belief import Augmented, Slots, WhiteRow
 
@@ -82,15 +81,8 @@ def _regress(
     block: Block, data: Rows, at: About, covariance: jax.Array, rule: Rule, levels: jax.Array
 ) -> tuple[Linearised, About, jax.Array, jax.Array]:
     """Rows regressed over what they read, covariance (P, u + p, u + p); where, their predicted values and stds."""
-    used, size = np.asarray(block.used, int), covariance.shape[1]
-    kappa = rule(size)
-    axes = np.concatenate([np.eye(size), -np.eye(size)]) * np.sqrt(size + kappa)
-    unit = np.concatenate([np.zeros((1, size)), axes]) if kappa else axes
-    middle = [kappa / (size + kappa)] if kappa else []
-    weight = jnp.asarray(np.concatenate([middle, np.full(2 * size, 0.5 / (size + kappa))]))
-    values, vectors = linalg.spectrum(covariance)
-    root = jnp.sqrt(jnp.maximum(values, FLOOR))
-    shift = jnp.einsum("puv,pv,sv->spu", vectors, root, jnp.asarray(unit))
+    used = np.asarray(block.used, int)
+    shift, unit, weight, whiten = sigma_points(covariance, rule)
     base = waist.read_biases(block, data, at.z)  # (P, p) in their units
     scale = data.scale[data.sensor]
 
@@ -102,14 +94,14 @@ def _regress(
     reference = value(jnp.zeros_like(shift[0]))
     moved = waist.difference(block, jax.lax.map(value, shift), reference[None])
     mean = jnp.einsum("s,spc->pc", weight, moved)
-    slope = jnp.einsum("s,spc,su->pcu", weight, moved - mean[None], jnp.asarray(unit))
+    slope = jnp.einsum("s,spc,su->pcu", weight, moved - mean[None], unit)
     left = jnp.einsum("s,spc->pc", weight, (moved - mean[None]) ** 2) - jnp.sum(slope**2, -1)
     extra = jnp.maximum(left, 0.0)
     std = jnp.sqrt(waist.noise_std(data, levels) ** 2 + extra)
     score, information = waist.weigh(block, data, reference + mean, levels, expected=True, extra=extra)
     step = waist.weigh(block, data, reference + mean, levels, expected=False, extra=extra)[1]
     information = jnp.minimum(information, step)
-    by = jnp.einsum("pcu,puv->pcv", slope, vectors.mT / root[:, :, None])
+    by = jnp.einsum("pcu,puv->pcv", slope, whiten)
     lin = Linearised(score, information, by[:, :, : len(used)], by[:, :, len(used) :])
     return lin, at, reference + mean, std
 
