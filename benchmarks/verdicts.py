@@ -2,23 +2,32 @@
 
 uv run python benchmarks/verdicts.py --runs 100 --case beacons --case noise-halved
 uv run python benchmarks/verdicts.py --runs 200 --case own --file runs.jsonl
+uv run python benchmarks/verdicts.py --runs 25 --case faults
 
-Three tables. One row a case: how fits ended; share of 89 % intervals that hold the truth, of all and of the non-zero
-biases; share of the biases called `determined` that lie beyond 4 sd; share of those with gamma above 0.9 that are
-called so; share of runs with a warning, and of what kind. Then how many of what is called `determined`, and of the
-coordinates of tracks, lie within 2, 3 and 4 sd. Then, of paths drawn from their motion, false alarms by kind.
+One row a case: how fits ended; share of 89 % intervals that hold the truth, of all and of the non-zero biases; share of
+the biases called `determined` that lie beyond 4 sd; share of those with gamma above 0.9 that are called so; share of
+runs with a warning, and of what kind. Then how many of what is called `determined`, and of the coordinates of tracks,
+lie within 2, 3 and 4 sd. Of `faults` that move a bias by 5 sd: how often they are named. Of paths
+drawn from their motion: false alarms by kind. Last, seconds of each check; the first pays for what all ask.
 """
 
 import argparse
 import json
 import sys
 from collections import Counter
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from time import perf_counter
+from unittest.mock import patch
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
 from scipy.stats import beta
 
-from probcal import ConstantVelocity, Network, Node, Problem, Target, assess, simulate
+from probcal import MAP, ConstantVelocity, Gaussian, Network, Node, Problem, Target, assess, fit, simulate
+from probcal.analysis.checks import CHECKS
 from probcal.cli.models import load_problem, load_truth
 from probcal.errors import FitError
 from probcal.inference.fit import calibrate
@@ -122,7 +131,86 @@ def anchored(scale):
     return make
 
 
+def wrong_of(sensor, column, change):
+    """Readings of one sensor that a function of them, their times, a size and a generator makes wrong."""
+
+    def wrong(table, size, rng):
+        mine = table["sensor"] == sensor
+        values, time = (table.loc[mine, name].to_numpy() for name in (column, "time"))
+        table = table.copy()
+        table.loc[mine, column] = change(values, time, size, rng)
+        return table
+
+    return wrong
+
+
+def correlated(table, size, rng):
+    """Two sensors that share an error with a memory of 5 rows."""
+    mine = table["sensor"].isin(["m3", "m4"])
+    noise = lfilter([1.0], [1.0, -np.exp(-0.2)], rng.standard_normal(table["time"].nunique()))
+    at = np.searchsorted(np.unique(table["time"]), table["time"])
+    return table.assign(arrival=table["arrival"] + np.where(mine, size * noise[at], 0.0))
+
+
+def half_on(values, time, size, rng):
+    """A jump halfway."""
+    return values + size * (time > np.median(time))
+
+
+def some(values, time, size, rng):
+    """A twentieth of the readings too large."""
+    return values + size * (rng.random(len(values)) < 0.05)
+
+
+def smooth(values):
+    """Readings without their noise, nearly, so that a fault leaves that as it is."""
+    return gaussian_filter1d(values, 4.0, mode="nearest")
+
+
+def delayed(values, time, size, rng):
+    """Each reading that of a time before."""
+    return values - size * np.gradient(smooth(values), time)
+
+
+def stretched(values, time, size, rng):
+    """Readings too large in proportion."""
+    return values + size * smooth(values)
+
+
+def apart(problem, other):
+    """By how many sds a bias moves at most from one problem to another, and how many the data tell."""
+    one, other = (fit(own, MAP(), prior=Gaussian()) for own in (problem, other))
+    before, after = (tree["calibration"]["mean"].values for tree in (one, other))
+    moved, scale = np.abs(after - before) / one["calibration"]["sd"].values, problem.scales
+    prior = 0.5 * np.sum((before**2 - after**2) / scale**2)
+    fall = one.attrs["log_evidence"] - other.attrs["log_evidence"] + prior
+    return float(moved.max()), float(np.sqrt(max(2.0 * fall, 0.0)))
+
+
+def faulty(network, wrong, unit=None):
+    """An own path without and with a fault.
+
+    Given a size to begin with, that of the fault is such that a bias moves by `MOVED` sd under a Gaussian prior, or the
+    data tell it by `TOLD`, whichever is less.
+    """
+
+    def make(run):
+        problem, truth = networks.own_path(network, run, 0.3, NOISES[network])
+        table, size = problem.measurements.table.frame, unit
+
+        def changed(size):
+            return problem.rebuild(wrong(table, size, np.random.default_rng(run)))
+
+        for _ in range(3 if unit else 0):
+            moved, told = apart(problem, changed(size))
+            size *= np.clip(min(MOVED / max(moved, 1e-9), TOLD / max(told, 1e-9)), 0.1, 10.0)
+        return changed(size), truth, problem
+
+    return make
+
+
 NAMES = ("beacons", "clocks", "pass", "bearings")
+MOVED, TOLD = 5.0, 12.0  # sd by which a fault moves a bias, and by which the data tell it at most
 NOISES = {"beacons": 0.1, "clocks": 0.05, "pass": 0.05, "bearings": 0.03, "signal": 0.05}
 NOTES = ("gain", "loo", "motion")  # kinds of findings that warn of nothing; smooth paths are not drawn from a motion
 RIGHT = {f"{name} own path": own(name, 0.3, noise) for name, noise in NOISES.items()}
@@ -144,14 +232,47 @@ WRONG = {
     "anchored-30": anchored(30.0),
     "signal": right("signal", 0.3),
 }
+FAULTS = {  # a case, and the kinds of finding that name what is wrong
+    "a beacon drifts": (
+        faulty("beacons", wrong_of("b1", "range", lambda y, t, a, _: y + a * t / t.max()), 1.0), "drifting",
+    ),
+    "a beacon jumps halfway": (faulty("beacons", wrong_of("b1", "range", half_on), 1.0), "drifting"),
+    "a beacon goes to and fro": (
+        faulty("beacons", wrong_of("b1", "range", lambda y, t, a, _: y + a * np.sin(t / 4)), 0.5), "drifting whiteness",
+    ),
+    "a beacon is late": (faulty("beacons", wrong_of("b3", "range", delayed), 0.2), "slope"),
+    "a twentieth of a beacon's ranges too long": (
+        faulty("beacons", wrong_of("b1", "range", some), 3.0), "outliers",
+    ),
+    "azimuths off by the sine of the direction": (
+        faulty("pass", wrong_of("r1", "azimuth", lambda y, t, a, _: y + a * np.sin(y)), 0.01), "slope",
+    ),
+    "ranges off in proportion": (
+        faulty("pass", wrong_of("r1", "range", stretched), 0.02), "slope",
+    ),
+    "azimuths the other way round": (faulty("pass", wrong_of("r1", "azimuth", lambda y, *_: -y)), "recoded"),
+    "a heading that jumps halfway": (faulty("pass", wrong_of("r1", "azimuth", half_on), 0.02), "drifting"),
+    "two clocks that share an error": (faulty("clocks", correlated, 0.3), "whiteness drifting"),
+    "noise of a beacon twice the declared": (
+        faulty("beacons", wrong_of("b1", "range", lambda y, t, a, rng: y + np.sqrt(3) * rng.standard_normal(len(y)))),
+        "level nis",
+    ),
+}  # fmt: skip
 MIRRORS = {name: right(name, 0.5) for name in ("line", "ceiling", "beside")}
-CASES = RIGHT | SMOOTH | MIRRORS | WRONG
+CASES = RIGHT | SMOOTH | MIRRORS | WRONG | {name: make for name, (make, _) in FAULTS.items()}
 OWN = [name for name in RIGHT if name.endswith("own path")]
 RECORDED = {
     "plaza": None, "plaza_free": None, "robots": "mrclam/MRCLAM_Dataset6", "sflab": "sflab_mic_toa/dataset_1_exp2.mat",
     "tdoa_flight": "uwb_tdoa", "ble_office": "ble_rss", "bearing_beacons": "roh_bearing",
 }  # fmt: skip
-GROUPS = {"own": OWN, "right": [*RIGHT], "smooth": [*SMOOTH], "mirrors": [*MIRRORS], "wrong": [*WRONG]}
+GROUPS = {
+    "own": OWN,
+    "right": [*RIGHT],
+    "smooth": [*SMOOTH],
+    "mirrors": [*MIRRORS],
+    "wrong": [*WRONG],
+    "faults": [*FAULTS],
+}
 GROUPS["recordings"] = [f"recording {name}" for name in RECORDED]
 SETTLED = [str(status) for status in Status if status.settled]
 DISTANCES = (2.0, 3.0, 4.0)  # sd
@@ -177,17 +298,28 @@ CASES |= RECORDINGS
 
 def one(case, run):
     """One run as plain data: lists of its biases; counts of the coordinates of its tracks, as `beyond`."""
-    problem, truth = CASES[case](run)
+    problem, truth, *clean = CASES[case](run)
     said = {"case": case, "run": run}
     try:
         tree, _ = calibrate(problem, key=run)
     except FitError:
         return said | {"status": "refused", "kinds": [], "tracks": [0, 0, 0, 0]}
-    tree = assess(problem, tree)
+    seconds = dict.fromkeys(CHECKS, 0.0)
+    said["apart"] = [apart(own, problem) for own in clean]
+    with patch.dict(
+        CHECKS, {name: replace(own, function=partial(timed, seconds, name, own)) for name, own in CHECKS.items()}
+    ):
+        tree = assess(problem, tree)
     findings = tree["finding"].to_dataset()
+    said["sentences"] = findings["sentence"].values.tolist()
     pairs = zip(findings["kind"].values.tolist(), findings["subject"].values.tolist(), strict=True)
     kinds = list(dict.fromkeys("motion" if subject.startswith("motion.") else kind for kind, subject in pairs))
-    said |= {"status": tree.attrs["status"], "kinds": kinds, "tracks": beyond(positions_off(tree, truth)).tolist()}
+    said |= {
+        "status": tree.attrs["status"],
+        "kinds": kinds,
+        "seconds": seconds,
+        "tracks": beyond(positions_off(tree, truth)).tolist(),
+    }
     group = tree["calibration"].to_dataset().assign(word=tree["verdict"]["verdict"])
     true = np.array([truth.biases.get(str(label), np.nan) for label in group["bias_label"].values])
     group = group.isel(bias_label=np.isfinite(true))
@@ -200,6 +332,14 @@ def one(case, run):
         "word": group["word"].values.astype(str),
     }
     return said | {name: column.tolist() for name, column in columns.items()}
+
+
+def timed(seconds, name, check, case):
+    """What a check finds, its seconds kept."""
+    began = perf_counter()
+    found = check(case)
+    seconds[name] = round(perf_counter() - began, 4)
+    return found
 
 
 def positions_off(tree, truth):
@@ -265,6 +405,27 @@ def row_of_reliability(case, runs):
     return f"| {case} | {len(runs)} | {cells(biases)} | {cells(tracks)} |"
 
 
+def row_of_power(case, runs):
+    """How often a fault is named by a finding of its kind, and by any; what it does to the biases and the data."""
+    kinds, count = set(FAULTS[case][1].split()), len(runs)
+    named = sum(bool(kinds & set(run["kinds"])) for run in runs)
+    warned = sum(bool(set(run["kinds"]) - set(NOTES)) or run["status"] != "converged" for run in runs)
+    moved, told = np.median([pair for run in runs for pair in run.get("apart", [])], 0)
+    return (
+        f"| {case} | {', '.join(sorted(kinds))} | {named} of {count} | {warned} of {count} | {moved:.1f} | {told:.1f} |"
+    )
+
+
+def rows_of_seconds(runs):
+    """Median and largest seconds of each check over simulated fits and recordings."""
+    for name in CHECKS:
+        cells = []
+        for recorded in (False, True):
+            own = [run["seconds"][name] for run in runs if "seconds" in run and (run["case"] in RECORDINGS) == recorded]
+            cells += [f"{np.median(own):.2f}", f"{np.max(own):.2f}"] if own else ["", ""]
+        yield f"| {name} | {' | '.join(cells)} |"
+
+
 def rows_of_rates(runs):
     """False alarms by kind of finding among settled fits of right models, with 95 % intervals."""
     settled = [run for run in runs if run["status"] in SETTLED]
@@ -313,6 +474,12 @@ def main():
     if own_paths:
         head = ("finding", "fits", "%", "95 % interval")
         table("False alarms, all own paths together", head, rows_of_rates(own_paths))
+    faults = [case for case in found if case in FAULTS]
+    if faults:
+        head = ("fault", "finding", "named", "any warning", "moves a bias by, sd", "told by the data, sd")
+        table("Power", head, (row_of_power(case, found[case]) for case in faults))
+    head = ("check", "simulated, median", "largest", "recordings, median", "largest")
+    table("Seconds", head, rows_of_seconds([run for runs in found.values() for run in runs]))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Statistical linearisation by sigma points, as the unscented and the cubature E-step need it.
 
-Each row is regressed on the state over the smoothed density of its epoch (posterior linearisation, Garcia-Fernandez
-et al. 2015; the unscented transform of Julier and Uhlmann, the cubature rule of Arasaratnam and Haykin 2009).
-Where a sensor is linear the result is that of the extended smoother.
+Each row is regressed on the state over the smoothed density of its epoch (posterior linearisation,
+Garcia-Fernandez et al. 2015; the unscented transform of Julier and Uhlmann, the cubature rule of
+Arasaratnam and Haykin 2009). Where a sensor is linear the result is that of the extended smoother.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,7 +33,7 @@ def cubature(entries: int) -> float:
 
 
 class PointSet(NamedTuple):
-    """Sigma points about means, each (..., u), by the symmetric root, which does not turn with rounding."""
+    """Sigma points about means, by the symmetric root, which does not turn with rounding."""
 
     shift: jax.Array  # (S, ..., u)
     unit: jax.Array  # (S, u) the same points for unit covariance
@@ -52,39 +52,46 @@ def sigma_points(covariance: jax.Array, rule: Rule) -> PointSet:
     values, vectors = linalg.spectrum(covariance)
     scale = jnp.sqrt(jnp.maximum(values, FLOOR))[..., None, :]
     root = (vectors * scale) @ vectors.mT
-    return PointSet(
-        jnp.einsum("...uv,sv->s...u", root, unit), jnp.asarray(unit), jnp.asarray(weight), vectors / scale @ vectors.mT
-    )
+    shift, whiten = jnp.einsum("...uv,sv->s...u", root, unit), vectors / scale @ vectors.mT
+    return PointSet(shift, jnp.asarray(unit), jnp.asarray(weight), whiten)
+
+
+def regress(
+    block: Block, points: PointSet, values: jax.Array, centre: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Mean (N, C) of values (S, N, C) less the centre, their slope (N, C, u), what is left over."""
+    moved = rows.difference(block, values, centre[None])
+    mean = jnp.einsum("s,snc->nc", points.weight, moved)
+    slope = jnp.einsum("s,snc,su->ncu", points.weight, moved - mean[None], points.unit)
+    square = jnp.einsum("s,snc->nc", points.weight, (moved - mean[None]) ** 2)
+    return mean, slope, jnp.maximum(square - jnp.sum(slope**2, -1), 0.0)
 
 
 def _points(block: Block, states: jax.Array, covariance: jax.Array, rule: Rule) -> tuple[jax.Array, PointSet]:
     """States (S, E, n) with the entries moved that the block reads, and the points of these."""
     used = np.asarray(block.used, int)
     points = sigma_points(covariance[:, used[:, None], used[None, :]], rule)
-    moved = jnp.broadcast_to(states, (len(points.weight), *states.shape)).at[:, :, used].add(points.shift)
-    return moved, points
+    all_of = jnp.broadcast_to(states, (len(points.weight), *states.shape))
+    return all_of.at[:, :, used].add(points.shift), points
 
 
 def _block(block: Block, data: Rows, point: Where, states: jax.Array, covariance: jax.Array, rule: Rule) -> Linearised:
     if not block.used:
         return rows.linearise(block, data, states, point.z, point.levels, expected=False)
-    at, points = _points(block, states, covariance, rule)
+    moved, points = _points(block, states, covariance, rule)
     centre = rows.predict(block, data, states, point.z)
-    values = jax.lax.map(lambda x: rows.predict(block, data, x, point.z), at)
-    moved = rows.difference(block, values, centre[None])
-    mean = jnp.einsum("s,snc->nc", points.weight, moved)
-    slope = jnp.einsum("s,snc,su->ncu", points.weight, moved - mean[None], points.unit)
-    left = jnp.einsum("s,snc->nc", points.weight, (moved - mean[None]) ** 2) - jnp.sum(slope**2, -1)
-    extra = jnp.maximum(left, 0.0)
+    values = jax.lax.map(lambda x: rows.predict(block, data, x, point.z), moved)
+    mean, slope, extra = regress(block, points, values, centre)
     score, weight = rows.weigh(block, data, centre + mean, point.levels, expected=False, extra=extra)
-    by_bias = jax.lax.map(lambda x: rows.linearise(block, data, x, point.z, point.levels, expected=False).bias, at)
+    by_bias = jax.lax.map(lambda x: rows.linearise(block, data, x, point.z, point.levels, expected=False).bias, moved)
     by_state = jnp.einsum("ncu,nuv->ncv", slope, points.whiten[data.epoch])
     return Linearised(score, weight, by_state, jnp.einsum("s,sncp->ncp", points.weight, by_bias))
 
 
 def regress_blocks(model: Model, point: Where, covariances: Sequence[jax.Array], rule: Rule) -> list[Linearised]:
-    """Every block regressed on the states over their smoothed densities; what is left over widens the noise."""
-    return [_block(block, data, point, point.states[r], covariances[r], rule) for block, data, r in model.each_block()]
+    """Blocks regressed on the states over their smoothed densities; what is left over widens noise."""
+    each = model.each_block()
+    return [_block(own, data, point, point.states[r], covariances[r], rule) for own, data, r in each]
 
 
 def expect_biases(model: Model, point: Where, covariances: Sequence[jax.Array], rule: Rule) -> tuple[Data, jax.Array]:

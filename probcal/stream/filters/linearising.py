@@ -10,7 +10,7 @@ from probcal.model import rows as waist
 from probcal.model.epochs import Epoch
 from probcal.model.model import Model
 from probcal.model.rows import Block, Linearised, Rows
-from probcal.model.sigma import Rule, sigma_points
+from probcal.model.sigma import Rule, regress, sigma_points
 from probcal.noise import gate_limits
 from probcal.stream.filters.belief import Augmented, Slots, WhiteRow
 
@@ -82,7 +82,7 @@ def _regress(
 ) -> tuple[Linearised, About, jax.Array, jax.Array]:
     """Rows regressed over what they read, covariance (P, u + p, u + p); where, their predicted values and stds."""
     used = np.asarray(block.used, int)
-    shift, unit, weight, whiten = sigma_points(covariance, rule)
+    points = sigma_points(covariance, rule)
     base = waist.read_biases(block, data, at.z)  # (P, p) in their units
     scale = data.scale[data.sensor]
 
@@ -91,17 +91,13 @@ def _regress(
         x = x.at[:, used].add(move[:, : len(used)]) if len(used) else x
         return waist.predict_local(block, data, x, base + scale * move[:, len(used) :])
 
-    reference = value(jnp.zeros_like(shift[0]))
-    moved = waist.difference(block, jax.lax.map(value, shift), reference[None])
-    mean = jnp.einsum("s,spc->pc", weight, moved)
-    slope = jnp.einsum("s,spc,su->pcu", weight, moved - mean[None], unit)
-    left = jnp.einsum("s,spc->pc", weight, (moved - mean[None]) ** 2) - jnp.sum(slope**2, -1)
-    extra = jnp.maximum(left, 0.0)
+    reference = value(jnp.zeros_like(points.shift[0]))
+    mean, slope, extra = regress(block, points, jax.lax.map(value, points.shift), reference)
     std = jnp.sqrt(waist.noise_std(data, levels) ** 2 + extra)
     score, information = waist.weigh(block, data, reference + mean, levels, expected=True, extra=extra)
     step = waist.weigh(block, data, reference + mean, levels, expected=False, extra=extra)[1]
     information = jnp.minimum(information, step)
-    by = jnp.einsum("pcu,puv->pcv", slope, whiten)
+    by = jnp.einsum("pcu,puv->pcv", slope, points.whiten)
     lin = Linearised(score, information, by[:, :, : len(used)], by[:, :, len(used) :])
     return lin, at, reference + mean, std
 
