@@ -238,7 +238,7 @@ FAULTS = {  # a case, and the kinds of finding that name what is wrong
     ),
     "a beacon jumps halfway": (faulty("beacons", wrong_of("b1", "range", half_on), 1.0), "drifting"),
     "a beacon goes to and fro": (
-        faulty("beacons", wrong_of("b1", "range", lambda y, t, a, _: y + a * np.sin(t / 4)), 0.5), "drifting whiteness",
+        faulty("beacons", wrong_of("b1", "range", lambda y, t, a, _: y + a * np.sin(t / 4)), 0.5), "drifting whiteness widened",
     ),
     "a beacon is late": (faulty("beacons", wrong_of("b3", "range", delayed), 0.2), "slope"),
     "a twentieth of a beacon's ranges too long": (
@@ -252,7 +252,7 @@ FAULTS = {  # a case, and the kinds of finding that name what is wrong
     ),
     "azimuths the other way round": (faulty("pass", wrong_of("r1", "azimuth", lambda y, *_: -y)), "recoded"),
     "a heading that jumps halfway": (faulty("pass", wrong_of("r1", "azimuth", half_on), 0.02), "drifting"),
-    "two clocks that share an error": (faulty("clocks", correlated, 0.3), "whiteness drifting"),
+    "two clocks that share an error": (faulty("clocks", correlated, 0.3), "drifting whiteness widened"),
     "noise of a beacon twice the declared": (
         faulty("beacons", wrong_of("b1", "range", lambda y, t, a, rng: y + np.sqrt(3) * rng.standard_normal(len(y)))),
         "level nis",

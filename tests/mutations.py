@@ -155,7 +155,10 @@ MUTATIONS = [
     Mutation("jnp.expm1(-2 * step)", "jnp.expm1(2 * step)", "test_samplers.py"),
     # model/sigma.py
     Mutation("np.full(2 * u, 0.5 / (u + kappa))", "np.full(2 * u, 1.0 / (u + kappa))", "test_methods.py"),
-    Mutation("\"s,snc->nc\", points.weight, (moved - mean[None]) ** 2) - jnp.sum(slope**2, -1)", "\"s,snc->nc\", points.weight, (moved - mean[None]) ** 2)", "test_methods.py"),
+    Mutation("jnp.maximum(square - jnp.sum(slope**2, -1), 0.0)", "jnp.maximum(square, 0.0)", "test_methods.py"),
+    Mutation("    root = (vectors * scale) @ vectors.mT", "    root = vectors * scale", "test_methods.py"),
+    # analysis/slopes.py: an answer at its bound is far from where a step from it ends
+    Mutation("at = climb_to_mode(expand, at.point, prior, CLIMB, CLOSE).at", "pass", "test_slopes.py"),
     # model/rows.py
     Mutation("rows.base + rows.scale * padded", "rows.base - rows.scale * padded", "test_exact.py"),
     Mutation("Linearised(score, weight, by_state, by_bias * rows.scale[rows.sensor][:, None, :])", "Linearised(score, weight, by_state, by_bias)", "test_exact.py"),

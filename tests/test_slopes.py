@@ -1,6 +1,8 @@
 """Residuals that follow the geometry, and readings that are counted another way."""
 
 import re
+import sys
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +20,9 @@ from probcal.geometry import bearing, elevation, norm
 from probcal.inference.fitted import take_up
 from probcal.simulate import as_key, derived_keys
 from probcal.types import float64
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
+import networks
 
 PLACES = np.array([(0, 0), (4000, 300), (3800, 4200), (-200, 3900)], float)
 TIME = np.arange(0.0, 600.0, 5.0)
@@ -201,3 +206,18 @@ def test_ranges_that_are_late_or_bend_are_named():
     (bent,) = sentences(table(bent=0.3))
     assert "the residuals follow the distance of the target" in bent
     assert 'shared="type"' in bent
+
+
+@pytest.mark.ci
+def test_a_beacon_so_late_that_its_place_is_given_up_is_named():
+    """The fit ends far off, at its bound, where a step alone does not mend it."""
+    problem, _ = networks.own_path("beacons", 11, 0.3, 0.1)
+    rows = problem.measurements.table.frame.copy()
+    mine, window = rows["sensor"] == "b3", np.hanning(21) / np.hanning(21).sum()
+    smooth = np.convolve(np.pad(rows.loc[mine, "range"], 10, mode="edge"), window, "valid")
+    rows.loc[mine, "range"] -= 7.0 * np.gradient(smooth, 0.5)
+    problem = problem.rebuild(rows)
+    tree = probcal.fit(problem)
+    assert tree.attrs["status"] == "at bound"
+    (late,) = said(probcal.assess(problem, tree), "slope")
+    assert late.startswith("b3.range: the residuals follow the rate of the reading")

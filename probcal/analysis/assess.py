@@ -1,13 +1,14 @@
 """`assess`: is the answer of a fit good? Innovations, predictive checks, left-out data, halves, and verdicts."""
 
 from collections import ChainMap
+from itertools import product
 
 import numpy as np
 import xarray as xr
 
 from probcal.analysis.check import Case, Checked
 from probcal.analysis.checks import CHECKS
-from probcal.analysis.findings import Finding, alarms, finding_group, in_order
+from probcal.analysis.findings import ALARMS, Finding, alarms, finding_group, in_order
 from probcal.analysis.verdict import (
     PART,
     RATE,
@@ -76,9 +77,13 @@ def _assessed(case: Case) -> xr.DataTree:
     findings = [one for name, own in found.items() if name not in signs for one in own.findings] + alarms(verdict)
     if "answer" not in case.has:  # likely causes; the message of a misfit has its own
         cause = "other" if "explained" in case.has else "misfit"
-        text = f"the fit ended {tree.attrs['status']}: the checks of its residuals and biases are not meaningful"
-        causes = [one for name, own in found.items() if cause in CHECKS[name].causes for one in own.findings]
-        findings = [Finding("status", "fit", text), *causes]
+        text = f"the fit ended {tree.attrs['status']}: its checks are left out, but for likely causes"
+        told = [own for name, own in found.items() if cause in CHECKS[name].causes]
+        findings = [Finding("status", "fit", text), *(one for own in told for one in own.findings)]
+        for word, own in product(ALARMS, told):
+            for m, why in own.doubts.get(word, {}).items():
+                label = fit.problem.labels[m]
+                findings.append(Finding(word, label, f"{label}: {why}"))
     result, text = widened(fit, case.rejected, tree, fit.root)
     said(result, sentence(text))
     findings = in_order(findings + [Finding("widened", "fit", text)] * bool(text))

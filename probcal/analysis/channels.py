@@ -37,7 +37,8 @@ def check_channels(case: Case) -> Checked:
     red = np.flatnonzero((channels.white < RATE / count) & (np.abs(r) > notable))
     if len(red):
         order = red[np.argsort(-np.abs(r[red]))]
-        text = f"innovations are correlated from one to the next: {sized(names, r, order)}"
+        text = f"innovations are correlated from one to the next: {sized(names, r, order)}: something changes"
+        text += " slowly that the model takes as constant, or the noise has a memory"
         findings.append(Finding("whiteness", names[order[0]], text))
     first = np.array([mine[0] for mine in channels.members], int)
     if replicas is not None:

@@ -21,6 +21,7 @@ FIRST = (
     "nis",
     "motion",
 )  # likely causes
+ALARMS = ("drifting", "conflicting")  # verdicts that are findings too
 LAST = ("predictive", "rest", "gain", "loo")  # and what says little of them
 
 
@@ -46,9 +47,7 @@ def alarms(verdict: xr.Dataset) -> list[Finding]:
     ):
         owners.setdefault((of[0], of[1]), []).append(label)
     return [
-        Finding(word, own[0], f"{listed(own)}: {reason}")
-        for (word, reason), own in owners.items()
-        if word in ("drifting", "conflicting")
+        Finding(word, own[0], f"{listed(own)}: {reason}") for (word, reason), own in owners.items() if word in ALARMS
     ]
 
 

@@ -20,7 +20,8 @@ def check_mirrors(case: Case) -> Checked:
     """
     fit, found, every, group = case.fit, dict[int, str](), rivals(case.tree), alike(case.tree)
     pairs = zip(every["mode"].values, every["gain"].values, strict=True)
-    told = [Finding("mirror", "fit", f"{name}: an answer {abs(gain):.1f} nats apart") for name, gain in pairs]
+    text = "another answer fits about as well ({:.1f} nats apart): {}: declare what tells them apart"
+    told = [Finding("mirror", "fit", text.format(abs(gain), name)) for name, gain in pairs]
     for name, away in zip(group["mode"].values, group["apart"].values, strict=True):
         for m in np.flatnonzero(away > DIFFERENT).tolist():
             found.setdefault(m, f"it is {away[m]:.1f} sd away in an answer that fits as well: {name}")

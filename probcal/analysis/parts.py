@@ -46,7 +46,7 @@ def _beyond(names: list[str], part: residuals.Squares) -> list[Finding]:
             order_out = order[out[order]]
             text = f"NIS a datum {sized(names, part.nis, order_out)} (limit {limit[order_out[0]]:.3g})"
             found.append(
-                Finding("nis", names[order_out[0]], f"{text}: the data scatter {word} than the declared noise")
+                Finding("nis", names[order_out[0]], f"{text}: the data scatter {word} than declared: check their std")
             )
     return found
 
@@ -77,12 +77,13 @@ def _unlike_the_rest(check: xr.Dataset) -> list[Finding]:
     order, findings = np.argsort(-gain), list[Finding]()
     worst = order[0]
     if gain[worst] > GAIN:
-        text = f"{names[worst]} fits the rest {gain[worst]:.1f} nats better calibrated than as stated"
+        text = f"calibration gains most for {names[worst]}: the rest predicts it by {gain[worst]:.1f} nats better"
         if len(order) > 1:
             text += f"; next {names[order[1]]}, {gain[order[1]]:.1f}"
         findings.append(Finding("gain", names[worst], text))
     nis, upper = check["rest_nis"].values, check["upper"].values
     for k in np.flatnonzero(nis > np.maximum(upper, PRACTICAL)):
-        text = f"{names[k]} does not fit the rest even when calibrated: NIS {nis[k]:.3g} a datum, limit {upper[k]:.3g}"
+        text = f"{names[k]} does not fit the rest even when calibrated: NIS {nis[k]:.3g} a datum, limit"
+        text += f" {upper[k]:.3g}: check its stated place, units and formula, or leave it out"
         findings.append(Finding("rest", names[k], text))
     return findings

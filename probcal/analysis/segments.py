@@ -44,7 +44,7 @@ class Compared(NamedTuple):
     unsolved: int  # biases that may differ and were not compared with others
 
 
-@check("explained", "factor")
+@check("explained", "factor", causes=["other"])
 def check_segments(case: Case) -> Checked:
     """What each bias would change from the first half of the recording to the second, and which of them do.
 
@@ -65,7 +65,8 @@ def check_segments(case: Case) -> Checked:
         if name == "halves":
             sd = float(np.sqrt(inflation[bias] / contrast.information[0, 0]))
             text = changed(problem, bias, float(contrast.estimate[0]), sd, limit)
-            drifts[bias] = text + _shape(compared.shapes.get(bias), grid.edges)
+            size = abs(float(contrast.estimate[0])) * problem.scales[bias]
+            drifts[bias] = text + _shape(compared.shapes.get(bias), grid.edges, size)
         else:
             disagreements[bias] = _disagreement(problem, contrast, square, limit_of(M, contrast.freedom))
     if changes:
@@ -247,13 +248,17 @@ def changed(problem: Problem, m: int, estimate: float, sd: float, limit: float) 
     )
 
 
-def _shape(shape: Contrast | None, edges: np.ndarray) -> str:
-    """Whether quarters tell of a jump, and where, or of a drift."""
+def _shape(shape: Contrast | None, edges: np.ndarray, size: float) -> str:
+    """Whether quarters tell of a jump, and where, or of a drift, and how to declare that."""
     if shape is None:
         return ""
     later = np.arange(1, len(edges))
-    shapes = {f"it jumps at about {edges[k]:.4g} s": 1.0 * (later >= k) for k in later} | {"it drifts": 1.0 * later}
-    return f"; {max(shapes, key=lambda name: shape.along(shapes[name]))}"
+    k = int(max(later, key=lambda k: shape.along(1.0 * (later >= k))))
+    said, times = f"it jumps at about {edges[k]:.4g} s", edges[[0, k]]
+    if shape.along(1.0 * later) > shape.along(1.0 * (later >= k)):
+        said, times = "it drifts", edges
+    pieces = ", ".join(f"{time:.4g}" for time in times)
+    return f"; {said}: give its Bias drift=Drift(({pieces}), scale={size:.2g})"
 
 
 def _disagreement(problem: Problem, contrast: Contrast, square: float, limit: float) -> str:

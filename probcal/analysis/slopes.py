@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -21,12 +21,15 @@ from probcal.analysis.check import Case, Checked, check
 from probcal.analysis.findings import Finding
 from probcal.analysis.pieces import COPIES, HELD, SUSPECT, TOGETHER, Contrast, grid_for
 from probcal.analysis.regressors import farthest, regressors
+from probcal.analysis.ridges import CLOSE
 from probcal.analysis.verdict import limit_of
+from probcal.gaussian.climb import climb_to_mode
 from probcal.gaussian.engine import Expansion, Factors, told_alone
 from probcal.inference import residuals
 from probcal.inference.fitted import Judged
 from probcal.labels import listed
 from probcal.linalg import invert
+from probcal.modes.explore import CLIMB
 
 TOLD = 1e-2  # share of the information about a shape, all else known, that must be left with all else free
 CONFIRMED = 0.5  # share of the expected gain in log density that must be seen where the data are without the shape
@@ -50,7 +53,7 @@ class Shape(NamedTuple):
     channels: tuple[int, ...]
 
 
-@check("explained", "factor")
+@check("explained", "factor", causes=["other"])
 def check_slopes(case: Case) -> Checked:
     """Channels whose residuals follow the geometry, and biases that would move without it."""
     return case.once(told_slopes)[0]
@@ -268,7 +271,11 @@ class Slopes:
             lambda data, own: {"y": np.where(np.asarray(data.mask) > 0, np.asarray(data.y) - own, 0.0)}, shift
         )
         expected = 0.5 * float((np.asarray(at.slope()) + factors.pull(at.point.z)) @ step[:-1])
-        at = fit.engine.settled(model, fit.point._replace(z=jax.device_put(z + step[:M])))
+        start = fit.point._replace(z=jax.device_put(z + step[:M]))
+        at = fit.engine.settled(model, start)
+        if fit.engine.cheap:  # a step is not all where the answer lies far off
+            expand = partial(fit.engine.settled, model)
+            at = climb_to_mode(expand, at.point, prior, CLIMB, CLOSE).at
         gain = at.density() + prior.value(at.point.z) - fit.expansion.density() - prior.value(z)
         if not gain > CONFIRMED * expected:
             return None
