@@ -77,7 +77,7 @@ def _assessed(case: Case) -> xr.DataTree:
     findings = [one for name, own in found.items() if name not in signs for one in own.findings] + alarms(verdict)
     if "answer" not in case.has:  # likely causes; the message of a misfit has its own
         cause = "other" if "explained" in case.has else "misfit"
-        text = f"the fit ended {tree.attrs['status']}: its checks are left out, but for likely causes"
+        text = f"the fit ended {tree.attrs['status']}, so it is not judged; findings after this may say why"
         told = [own for name, own in found.items() if cause in CHECKS[name].causes]
         findings = [Finding("status", "fit", text), *(one for own in told for one in own.findings)]
         for word, own in product(ALARMS, told):

@@ -28,7 +28,7 @@ from probcal.results.read import summed_log_likelihood
 STEPS = 20  # Gauss-Newton steps of a refit
 TOLERANCE = 1e-5  # nats
 WORK = 3e9  # operations of all eliminations beyond which a refit is one step from the fit
-PLACED = 100  # refits up to which the places of targets at rest are integrated anew
+PLACED = 30_000  # rows of all refits up to which places of targets at rest are integrated anew
 PINNED = 1e12  # precision that holds a bias at zero, and leaves the evidence as if it were fixed there
 TARGETS = 32  # beyond which targets are not left out one by one
 
@@ -39,13 +39,17 @@ class _Refits(NamedTuple):
     fit: Judged
     quick: bool  # one step from the fit instead of a search
     placed: bool  # with the places of static targets integrated anew
+    kind: str  # in words
 
     @classmethod
     def of(cls, fit: Judged, jobs: int) -> _Refits:
         """Of a fit, for this many jobs."""
         model = fit.problem.model
         quick = not fit.whole or 2.0 * jobs * model.state_size * model.biases**2 > WORK
-        return cls(fit, quick, fit.problem.tilted and jobs <= PLACED and not quick)
+        few = jobs * len(fit.problem.measurements.time) <= PLACED
+        places = fit.problem.tilted and not quick
+        kind = ("one step" if quick else "full") + ", places as at the fit" * (places and not few)
+        return cls(fit, quick, places and few, kind)
 
     def run(self, out: np.ndarray | None, alpha: np.ndarray) -> tuple[float, float]:
         """Evidence by Laplace's formula, and least squares, at the mode without the rows (of the table) in `out`."""
@@ -76,7 +80,7 @@ class Left(NamedTuple):
     """
 
     values: dict[str, np.ndarray]
-    quick: bool  # one step from the fit instead of a search
+    refits: str  # how they were made
 
 
 def leave_out(fit: Judged, name: str, chosen: Sequence[str]) -> Left | None:
@@ -104,7 +108,7 @@ def leave_out(fit: Judged, name: str, chosen: Sequence[str]) -> Left | None:
     values = {"elpd": elpd[:, 0], "rest_nis": nis[:, 0]}
     if sensors:
         values |= {"elpd_stated": elpd[:, 1], "difference": elpd[:, 0] - elpd[:, 1], "stated_nis": nis[:, 1]}
-    return Left(values, refits.quick)
+    return Left(values, refits.kind)
 
 
 class Pointwise(NamedTuple):

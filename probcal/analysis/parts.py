@@ -65,7 +65,7 @@ def _left_out(case: Case, name: str, group: np.ndarray, groups: dict[str, xr.Dat
     if found is None or not all(np.isfinite(values).all() for values in found.values.values()):
         return []  # the rest alone leaves a flat prior without an answer
     check = groups[key] = check.assign(along(name, found.values))
-    check.attrs |= {"refits": "one step" if found.quick else "full", "elpd": float(check["elpd"].sum())}
+    check.attrs |= {"refits": found.refits, "elpd": float(check["elpd"].sum())}
     if check.sizes[name] > 1:
         check.attrs["elpd_se"] = leave.standard_error(check["elpd"].values)
     return _unlike_the_rest(check) if "difference" in check else []
@@ -77,7 +77,8 @@ def _unlike_the_rest(check: xr.Dataset) -> list[Finding]:
     order, findings = np.argsort(-gain), list[Finding]()
     worst = order[0]
     if gain[worst] > GAIN:
-        text = f"calibration gains most for {names[worst]}: the rest predicts it by {gain[worst]:.1f} nats better"
+        text = f"calibration matters most for {names[worst]}, no fault by itself: given the rest its"
+        text += f" data are {gain[worst]:.1f} nats likelier than as stated"
         if len(order) > 1:
             text += f"; next {names[order[1]]}, {gain[order[1]]:.1f}"
         findings.append(Finding("gain", names[worst], text))

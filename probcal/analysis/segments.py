@@ -243,8 +243,8 @@ def changed(problem: Problem, m: int, estimate: float, sd: float, limit: float) 
     bias = problem.biases[m]
     unit = f" {bias.unit}" if bias.unit != "1" else ""
     return (
-        f"second half less first {estimate * bias.scale:.3g} \N{PLUS-MINUS SIGN} {sd * bias.scale:.2g}{unit} "
-        f"({abs(estimate) / sd:.1f} sd, limit {np.sqrt(limit):.1f})"
+        f"from the first half to the second it changes by {estimate * bias.scale:.3g}"
+        f" \N{PLUS-MINUS SIGN} {sd * bias.scale:.2g}{unit} ({abs(estimate) / sd:.1f} sd, limit {np.sqrt(limit):.1f})"
     )
 
 
@@ -258,7 +258,7 @@ def _shape(shape: Contrast | None, edges: np.ndarray, size: float) -> str:
     if shape.along(1.0 * later) > shape.along(1.0 * (later >= k)):
         said, times = "it drifts", edges
     pieces = ", ".join(f"{time:.4g}" for time in times)
-    return f"; {said}: give its Bias drift=Drift(({pieces}), scale={size:.2g})"
+    return f"; {said}: declare its Bias(..., drift=Drift(({pieces}), scale={size:.2g}))"
 
 
 def _disagreement(problem: Problem, contrast: Contrast, square: float, limit: float) -> str:

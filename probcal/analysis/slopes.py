@@ -38,7 +38,7 @@ MOST = 5.0  # times the largest part that a shape has, to which coefficients tha
 LOOSE = 1e-6  # times the information about a shape, by which one that is free is held
 
 SAID = {  # what the residuals of a channel follow
-    "time": "the rate of the reading",
+    "time": "the rate of the reading, as if it came late or early",
     "direction": "the direction of the target",
     "distance": "the distance of the target",
     "elevation": "the elevation of the target",
@@ -293,7 +293,7 @@ class Slopes:
 def _advice(name: str, what: str, unit: str, scale: str, far: str) -> str:
     """The line that declares a shape of a channel."""
     if name == "time":
-        advice = 'correct their times, or give the first node of each scale={"time_offset": '
+        advice = 'correct their times, or give the first node of each sensor scale={"time_offset": '
         return f"{advice}{scale}}}"
     if name == "reading":
         return f'multiply {what} by 1 + gain, with a bias gain=Bias("1", {scale})'
@@ -330,8 +330,8 @@ def _said(found: Slopes) -> Checked:
         most = size if name == "time" else largest
         text = (
             f"{listed([names[c] for c in channels])}: the residuals follow {SAID[name]}, by up to"
-            f" {most:.2g}{f' {unit}' if unit != '1' else ''} ({sd:.1f} sd, limit {limit:.1f}; mean"
-            f" square {case.innovations.spread(mine):.2g}, {after.spread(mine):.2g} without): "
+            f" {most:.2g}{f' {unit}' if unit != '1' else ''} ({sd:.1f} sd, limit {limit:.1f}; without"
+            f" that their mean square is {after.spread(mine):.2g} and not {case.innovations.spread(mine):.2g}): "
         )
         text += _advice(name, f"{channel} of {kind}", unit, f"{size:.2g}{shared}", f"{farthest(looked.fit):.3g}")
         findings.append(Finding("slope", names[channels[0]], text))

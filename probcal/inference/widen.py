@@ -216,7 +216,8 @@ def widened(fit: Judged, rejected: Rejection, tree: xr.DataTree, root: Any) -> t
         if len(wide) and wide.max() >= TOLD:
             told = float(wide.max())
             _widen_biases(result, group, wide)
-            grown.append(f"biases are widened by up to {told:.2g} ({group['bias_label'].values[int(wide.argmax())]})")
+            most_of = group["bias_label"].values[int(wide.argmax())]
+            grown.append(f"biases are already widened by up to {told:.2g} times (most {most_of})")
     tracks = track_factors(fit, rejected, tree.children["track"], root, wide) if "track" in tree.children else {}
     largest = {name: float(own.max(initial=1.0)) for name, own in tracks.items()}
     name, most = max(largest.items(), key=lambda pair: pair[1], default=("", 1.0))
@@ -224,8 +225,8 @@ def widened(fit: Judged, rejected: Rejection, tree: xr.DataTree, root: Any) -> t
         told = max(told, most)
         for own, factor in tracks.items():
             _widen_track(result, own, factor)
-        target, verb = tree["track"][name].attrs["target"], "" if grown else "are widened "
-        grown.append(f"tracks {verb}by up to {most:.2g} ({target})")
+        target, verb = tree["track"][name].attrs["target"], "" if grown else "are already widened "
+        grown.append(f"tracks {verb}by up to {most:.2g} times ({target})")
     result.attrs["widened"] = told
     return result, f"{text}; the sd of the {', those of the '.join(grown)}" if grown else text
 
