@@ -169,7 +169,7 @@ def test_places_are_integrated_anew_where_their_rows_are_few():
         return leave._Refits.of(SimpleNamespace(whole=True, problem=problem), 10)[2:]
 
     assert refits(leave.PLACED // 10) == (True, "full")
-    assert refits(leave.PLACED // 10 + 1) == (False, "full, places as at the fit")
+    assert refits(leave.PLACED // 10 + 1) == (False, "full" + leave.PLAIN)
 
 
 def test_the_change_between_pieces_is_generalised_least_squares(linear):

@@ -29,6 +29,7 @@ STEPS = 20  # Gauss-Newton steps of a refit
 TOLERANCE = 1e-5  # nats
 WORK = 3e9  # operations of all eliminations beyond which a refit is one step from the fit
 PLACED = 30_000  # rows of all refits up to which places of targets at rest are integrated anew
+PLAIN = ", places by Laplace's formula"  # beyond that
 PINNED = 1e12  # precision that holds a bias at zero, and leaves the evidence as if it were fixed there
 TARGETS = 32  # beyond which targets are not left out one by one
 
@@ -48,12 +49,13 @@ class _Refits(NamedTuple):
         quick = not fit.whole or 2.0 * jobs * model.state_size * model.biases**2 > WORK
         few = jobs * len(fit.problem.measurements.time) <= PLACED
         places = fit.problem.tilted and not quick
-        kind = ("one step" if quick else "full") + ", places as at the fit" * (places and not few)
+        kind = ("one step" if quick else "full") + PLAIN * (places and not few)
         return cls(fit, quick, places and few, kind)
 
     def run(self, out: np.ndarray | None, alpha: np.ndarray) -> tuple[float, float]:
         """Evidence by Laplace's formula, and least squares, at the mode without the rows (of the table) in `out`."""
-        fit, model, point = self.fit, self.fit.problem.model, self.fit.point
+        fit, point, plain = self.fit, self.fit.point, self.kind.endswith(PLAIN)
+        model = (fit.problem.untilted if plain else fit.problem).model
         if out is not None:
             model = model.weighted([~out[index][:, None] for index in fit.problem.row_index])
             if self.placed:

@@ -279,8 +279,8 @@ class Propagation(Task):
         own = jax.random.fold_in(self.key, 1 + turn)
         self.chain, swept = sweep_blocks(self.form, self.first, self.members, cavity, self.chain, own)
         self.swept = swept = jax.device_get(swept)
-        tilted = invert(swept.covariance)
-        new = Blocks(tilted - cavity.precision, np.einsum("bij,bj->bi", tilted, swept.mean) - cavity.pull)
+        wanted = invert(swept.covariance)
+        new = Blocks(wanted - cavity.precision, np.einsum("bij,bj->bi", wanted, swept.mean) - cavity.pull)
         floor = -MINUS * cavity.precision  # what is left of a cavity stays positive
         there = np.isin(self.members, self.form.hierarchy.learnt)  # a site is of the biases that it governs alone
         positive = without_negative(new.precision - floor, LEAST) + floor
