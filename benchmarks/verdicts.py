@@ -238,7 +238,8 @@ FAULTS = {  # a case, and the kinds of finding that name what is wrong
     ),
     "a beacon jumps halfway": (faulty("beacons", wrong_of("b1", "range", half_on), 1.0), "drifting"),
     "a beacon goes to and fro": (
-        faulty("beacons", wrong_of("b1", "range", lambda y, t, a, _: y + a * np.sin(t / 4)), 0.5), "drifting whiteness widened",
+        faulty("beacons", wrong_of("b1", "range", lambda y, t, a, _: y + a * np.sin(t / 4)), 0.5),
+        "drifting whiteness widened",
     ),
     "a beacon is late": (faulty("beacons", wrong_of("b3", "range", delayed), 0.2), "slope"),
     "a twentieth of a beacon's ranges too long": (
