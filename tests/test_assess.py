@@ -168,8 +168,8 @@ def test_places_are_integrated_anew_where_their_rows_are_few():
         problem = SimpleNamespace(tilted=True, model=model, measurements=SimpleNamespace(time=np.zeros(rows)))
         return leave._Refits.of(SimpleNamespace(whole=True, problem=problem), 10)[2:]
 
-    assert refits(leave.PLACED // 10) == (True, "full")
-    assert refits(leave.PLACED // 10 + 1) == (False, "full" + leave.PLAIN)
+    assert refits(leave.PLACED // 10) == (True, False)
+    assert refits(leave.PLACED // 10 + 1) == (False, True)
 
 
 def test_the_change_between_pieces_is_generalised_least_squares(linear):

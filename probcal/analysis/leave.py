@@ -40,7 +40,7 @@ class _Refits(NamedTuple):
     fit: Judged
     quick: bool  # one step from the fit instead of a search
     placed: bool  # with the places of static targets integrated anew
-    kind: str  # in words
+    plain: bool  # with these by Laplace's formula, in all
 
     @classmethod
     def of(cls, fit: Judged, jobs: int) -> _Refits:
@@ -49,13 +49,12 @@ class _Refits(NamedTuple):
         quick = not fit.whole or 2.0 * jobs * model.state_size * model.biases**2 > WORK
         few = jobs * len(fit.problem.measurements.time) <= PLACED
         places = fit.problem.tilted and not quick
-        kind = ("one step" if quick else "full") + PLAIN * (places and not few)
-        return cls(fit, quick, places and few, kind)
+        return cls(fit, quick, places and few, places and not few)
 
     def run(self, out: np.ndarray | None, alpha: np.ndarray) -> tuple[float, float]:
         """Evidence by Laplace's formula, and least squares, at the mode without the rows (of the table) in `out`."""
-        fit, point, plain = self.fit, self.fit.point, self.kind.endswith(PLAIN)
-        model = (fit.problem.untilted if plain else fit.problem).model
+        fit, point = self.fit, self.fit.point
+        model = (fit.problem.untilted if self.plain else fit.problem).model
         if out is not None:
             model = model.weighted([~out[index][:, None] for index in fit.problem.row_index])
             if self.placed:
@@ -110,7 +109,7 @@ def leave_out(fit: Judged, name: str, chosen: Sequence[str]) -> Left | None:
     values = {"elpd": elpd[:, 0], "rest_nis": nis[:, 0]}
     if sensors:
         values |= {"elpd_stated": elpd[:, 1], "difference": elpd[:, 0] - elpd[:, 1], "stated_nis": nis[:, 1]}
-    return Left(values, refits.kind)
+    return Left(values, ("one step" if refits.quick else "full") + PLAIN * refits.plain)
 
 
 class Pointwise(NamedTuple):

@@ -254,11 +254,11 @@ def _shape(shape: Contrast | None, edges: np.ndarray, size: float) -> str:
         return ""
     later = np.arange(1, len(edges))
     k = int(max(later, key=lambda k: shape.along(1.0 * (later >= k))))
-    said, times = f"it jumps at about {edges[k]:.4g} s", edges[[0, k]]
+    at = [f"{time:.13g}" for time in np.round(edges, 3)]  # seconds since 1970 too
+    said, times = f"it jumps at about {at[k]} s", [at[0], at[k]]
     if shape.along(1.0 * later) > shape.along(1.0 * (later >= k)):
-        said, times = "it drifts", edges
-    pieces = ", ".join(f"{time:.4g}" for time in times)
-    return f"; {said}: declare its Bias(..., drift=Drift(({pieces}), scale={size:.2g}))"
+        said, times = "it drifts", at
+    return f"; {said}: declare its Bias(..., drift=Drift(({', '.join(times)}), scale={size:.2g}))"
 
 
 def _disagreement(problem: Problem, contrast: Contrast, square: float, limit: float) -> str:
