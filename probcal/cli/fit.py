@@ -52,7 +52,7 @@ def run(
     # import modules that are needed later while kernels compile; what fails to load fails where
     # it is needed
     def load() -> None:
-        for name in ["scipy.stats", *drawn] if options["assessed"] else []:
+        for name in drawn:
             with suppress(ImportError):
                 importlib.import_module(name)
 
