@@ -1,6 +1,7 @@
-"""Power scaling: how prior and likelihood move the posterior of every bias (Kallioinen et al. 2024).
+"""Power scaling: how prior and likelihood move each posterior (Kallioinen et al. 2024).
 
-What `arviz_stats.psense` gives, for all biases in arrays: ArviZ takes as long to load as the check of a whole fit.
+The numbers of `arviz_stats.psense`, for all biases in arrays: ArviZ takes longer to load than a fit
+is checked.
 """
 
 from __future__ import annotations
@@ -12,9 +13,6 @@ from probcal.analysis.check import Case, Checked, check
 from probcal.analysis.leave import weighable
 from probcal.inference.psis import smoothed
 from probcal.results.read import summed_log_likelihood
-
-THRESHOLD = 0.05  # of the distance a power, ArviZ's own
-POWERS = np.array([0.99, 1.01])  # of the prior or the likelihood
 
 
 @check()
@@ -44,18 +42,19 @@ def check_scaling(case: Case) -> Checked:
         {way: ("bias_label", value[finite]) for way, value in found.items()},
         coords={"bias_label": draws["bias_label"].values[finite]},
     )
-    group.attrs |= {"noise": noise, "threshold": max(THRESHOLD, noise)}
+    group.attrs |= {"noise": noise, "threshold": max(0.05, noise)}
     return Checked({"sensitivity": group})
 
 
 def _distance(draws: np.ndarray, log_density: np.ndarray) -> np.ndarray:
-    """Sensitivity (M,) of draws (draw, M) to powers of a density (draw,): distance from the draws a log2 of the power.
+    """Sensitivity (M,) of draws (draw, M) to powers of a density (draw,): distance a log2 of them.
 
     Distances are those of the draws as they are and as weighted by the power, the larger one of either direction.
     """
-    weights = np.exp(smoothed((POWERS - 1)[:, None] * log_density)[0])
+    powers = np.array([0.99, 1.01])
+    weights = np.exp(smoothed((powers - 1)[:, None] * log_density)[0])
     far = [np.maximum(_apart(draws, own), _apart(-draws, own)) for own in weights]
-    return np.mean(np.stack(far) / np.abs(np.log2(POWERS))[:, None], 0)
+    return np.mean(np.stack(far) / np.abs(np.log2(powers))[:, None], 0)
 
 
 def _apart(draws: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -75,7 +75,7 @@ class _Chain(NamedTuple):
     levels: np.ndarray  # (H,)
     phi: Any  # a `Phi`
     reference: Reference  # under its noise
-    rest: float  # of the log density there, beside that of the Gaussian
+    rest: float  # of the log density there, next to that of the Gaussian
     rate: float  # of the last turn: how likely it was taken
 
 

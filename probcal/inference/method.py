@@ -52,7 +52,7 @@ class State(NamedTuple):
 
 
 class Context(NamedTuple):
-    """What a run is given beside the problem."""
+    """The surroundings of a run: key, monitor, storage, threads."""
 
     key: jax.Array
     monitor: Monitor = Monitor()  # what says how far it is, and when to stop: this one never does

@@ -1,6 +1,6 @@
 """The methods as values, their names on the command line, and which priors each takes.
 
-To add one: a module beside this one with a frozen dataclass that inherits `inference.run.Method`, entered here; of a
+To add one: a module next to this one with a frozen dataclass that inherits `inference.run.Method`, entered here; of a
 wing, in its own METHODS and in `probcal/wings.py`.
 """
 

@@ -17,7 +17,6 @@ R_HAT = 1.01  # above which chains have not mixed
 ESS = 100  # effective draws a chain below which its quantiles are not to be trusted
 UNSURE = 0.1  # standard error of the weight of a side above which it is not known
 
-LEAST = 4  # draws of a chain that can show anything
 FEW = 0.25  # share of few draws that must be effective
 NOISE = 4.0  # over the draws of a chain: by how much r_hat is above 1 without a reason
 
@@ -39,7 +38,7 @@ def mixing(draws: np.ndarray) -> dict[str, np.ndarray]:
         )
         found["ess_tail"][m] = tail if np.isfinite(tail) else found["ess"][m]
         if "r_hat" in found:
-            moves = draws.shape[1] < LEAST or np.ptp(draws[..., m], axis=1).any()  # else each chain stands still
+            moves = draws.shape[1] < 4 or np.ptp(draws[..., m], axis=1).any()  # else each chain stands still
             found["r_hat"][m] = array_stats.rhat(draws[..., m]) if moves else np.inf
     return {name: np.nan_to_num(values, nan=whole[name], posinf=np.inf) for name, values in found.items()}
 

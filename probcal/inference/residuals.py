@@ -31,7 +31,7 @@ else:
     special = Later("scipy.special")
 
 PRACTICAL = 1.25  # factor from 1 within which a NIS beyond its limits is no finding
-# sd of its lag-1 correlation from which a channel is called correlated, beside its Ljung-Box test
+# sd of its lag-1 correlation from which a channel is called correlated, next to its Ljung-Box test
 LAGGED = 2.5
 NOTABLE = 0.1  # lag-1 correlation, and mean, of innovations within which neither is
 LAGS = 10  # of the Ljung-Box statistic

@@ -12,6 +12,7 @@ from probcal.gaussian.mode import Point
 from probcal.gaussian.room import check_room
 from probcal.inference.method import Context, Method
 from probcal.inference.methods import MAP
+from probcal.inference.profile import profiled
 from probcal.inference.progress import Monitor, Stopped
 from probcal.inference.run import Maximiser
 from probcal.labels import listed
@@ -118,9 +119,11 @@ def solve_timed(
     if not method.climbs or found.motion != "used":
         return found
     try:
-        return _beside_mirrors(found, cast("Maximiser", found.method), context)
+        ran = cast("Maximiser", found.method)
+        found = first = _beside_mirrors(found, ran, context)
+        return profiled(first, lambda held, point: _like_first(first, held, ran, point, context), monitor)
     except MemoryError:
-        return found.noted("Memory did not hold what looking at the other side of a mirror takes.")
+        return found.noted("Memory did not hold what looking at other answers takes.")
 
 
 def each_start[T](places: Sequence[T], method: Method, monitor: Monitor) -> Iterator[tuple[int, T]]:

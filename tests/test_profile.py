@@ -1,0 +1,123 @@
+"""Mixtures along ridges and over two sides of tracks, beside exact posteriors and the truth."""
+
+from unittest.mock import patch
+
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+
+import probcal
+from probcal import (
+    MAP,
+    Bias,
+    Channel,
+    ConstantVelocity,
+    Gaussian,
+    Network,
+    Node,
+    Problem,
+    RandomWalk,
+    Target,
+    sensor,
+)  # fmt: skip
+from probcal.geometry import norm
+from probcal.inference import profile
+
+PLACES = np.array([(-3.0, -3.0), (3.0, -3.0), (-3.0, 3.0), (3.0, 3.0)])
+HEIGHTS = np.array([1.54, 1.60, 1.66, 1.58])
+NOISE, SCALE = 0.05, 0.3
+
+
+@sensor(range=Channel("m", std=NOISE))
+def slant(target, pose, *, range_offset=Bias("m", SCALE)):
+    """Range to a target whose height is a state of its own."""
+    away = target.position - pose.position
+    return dict(range=jnp.hypot(norm(away), target.height - pose.height) + range_offset)
+
+
+def recording(nodes, path, times, height, offsets, seed):
+    """The network and its rows of ranges to a path (T, 2) at one height."""
+    rng = np.random.default_rng(seed)
+    network = Network([slant.on(Node(f"a{k}", PLACES[k], height=HEIGHTS[k])) for k in nodes])
+    tables = [
+        pd.DataFrame({"time": times, "sensor": f"a{k}", "range": np.hypot(
+            np.linalg.norm(path - PLACES[k], axis=1), height - HEIGHTS[k]) + own + NOISE * rng.normal(size=len(times))})
+        for k, own in zip(nodes, offsets, strict=True)
+    ]  # fmt: skip
+    return network, pd.concat(tables)
+
+
+def known_path(seed, height):
+    """A problem of two ranges to a known path of unknown height; mean and sd of offsets and height by quadrature."""
+    times, prior = np.arange(0, 20, 0.5), (1.5, 0.6)
+    path = np.stack([0.4 * times - 4, 1 + 0 * times], 1)
+    network, table = recording((0, 1), path, times, height, (-0.1, -0.07), seed)
+    start = {"position": (path[0], 1e-3), "velocity": ((0.4, 0.0), 1e-4)}
+    problem = Problem(network, Target(ConstantVelocity(1e-4) + RandomWalk("height", "m", 0.0, prior), start), table)
+    h = np.linspace(-1.5, 4.5, 6001)
+    far = np.linalg.norm(path[:, None] - PLACES[:2], axis=2)
+    left = table["range"].values.reshape(2, -1, 1) - np.hypot(far.T[:, :, None], h - HEIGHTS[:2, None, None])
+    variance = 1 / (len(times) / NOISE**2 + SCALE**-2)
+    mean = variance * left.sum(1) / NOISE**2
+    density = 0.5 * (mean**2 / variance - (left**2).sum(1) / NOISE**2).sum(0) - 0.5 * ((h - prior[0]) / prior[1]) ** 2
+    weight = np.exp(density - density.max())
+    values = np.stack([*mean, h])
+    middle = values @ weight / weight.sum()
+    spread = (values - middle[:, None]) ** 2 @ weight / weight.sum() + np.array([variance, variance, 0.0])
+    return problem, middle, np.sqrt(spread)
+
+
+def told(tree):
+    """Mean and sd of the offsets and of the height at the first epoch."""
+    track, own = tree["track/target"].to_dataset().sel(component="height"), tree["calibration"]
+    return (np.append(own[name].values, track[name].values[0]) for name in ("mean", "sd"))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_height_on_two_sides_has_the_exact_moments(seed):
+    problem, exact, exact_sd = known_path(seed, 3.0)
+    tree = probcal.fit(problem, MAP(), prior=Gaussian())
+    mean, sd = told(tree)
+    assert (np.abs(mean - exact) < 0.1 * exact_sd).all()
+    np.testing.assert_allclose(sd, exact_sd, rtol=0.05)
+    assert "on which side height lies" in tree.attrs["message"]
+
+
+def flat(seed):
+    """Four anchors nearly in a plane, a tag half a metre off it, offsets and height drawn from their priors."""
+    rng, times = np.random.default_rng(1000 + seed), np.arange(0, 40, 0.1)
+    offsets, height = rng.normal(0, SCALE, 4), 1.6 + 0.5 * rng.choice([-1, 1])
+    path = np.stack([1.6 * np.cos(times / 3), 1.6 * np.sin(times / 3) + 0.2 * np.sin(times / 1.1)], 1)
+    network, table = recording(range(4), path, times, height, offsets, seed)
+    return (
+        Problem(network, ConstantVelocity(0.15) + RandomWalk("height", "m", 0.003, (1.6, 0.7)), table),
+        offsets,
+        height,
+    )
+
+
+@pytest.mark.ci
+def test_offsets_that_trade_with_a_height_are_in_their_intervals(tmp_path):
+    """Of these 16, by one Gaussian 5 are and by the mixture 15; the height is half a metre off the plane."""
+    holds = []
+    for seed in range(2, 6):
+        problem, offsets = flat(seed)
+        tree = probcal.fit(problem, MAP(), prior=Gaussian())
+        own = tree["calibration"]
+        holds.append((own["lower"].values < offsets) & (offsets < own["upper"].values))
+    assert np.sum(holds) >= 13
+    found = probcal.assess(problem, tree)
+    probcal.save(found, tmp_path / "fit.nc")
+    assert probcal.load(tmp_path / "fit.nc").attrs["message"] == found.attrs["message"]
+
+
+def test_answers_along_a_ridge_are_weighed_as_those_on_both_sides_are():
+    problem, _, _ = known_path(0, 3.0)
+    sides = probcal.fit(problem, MAP(), prior=Gaussian())
+    with patch.multiple(profile, FAR=0.0, ALIKE=0.0):
+        ridge = probcal.fit(problem, MAP(), prior=Gaussian())
+    assert "hardly tell height" in ridge.attrs["message"]
+    (mean, sd), (wanted, wanted_sd) = told(ridge), told(sides)
+    assert (np.abs(mean - wanted) < 0.2 * wanted_sd).all()
+    np.testing.assert_allclose(sd, wanted_sd, rtol=0.15)
