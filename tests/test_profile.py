@@ -121,3 +121,5 @@ def test_answers_along_a_ridge_are_weighed_as_those_on_both_sides_are():
     (mean, sd), (wanted, wanted_sd) = told(ridge), told(sides)
     assert (np.abs(mean - wanted) < 0.2 * wanted_sd).all()
     np.testing.assert_allclose(sd, wanted_sd, rtol=0.15)
+    own = ridge["calibration"].to_dataset()  # the factors that hold a place are no data
+    np.testing.assert_allclose(own["gamma"], 1 - (own["sd"].values / SCALE) ** 2, atol=1e-6)

@@ -291,10 +291,12 @@ def mixture_of(first: Posterior, parts: Sequence[Posterior], weights: np.ndarray
 
 def _summary(parts: list[Summary], first: Summary, drawn: list[Any], weights: Any) -> Summary:
     """Moments of the mixture, and intervals of its draws."""
-    names = ("gamma", "precision", "levels")
-    averages: Any = {k: _averaged(weights, (getattr(own, k) for own in parts)) for k in names}
     mean = _averaged(weights, (own.mean for own in parts))
     square = (own.covariance.matrix() + np.outer(own.mean - mean, own.mean - mean) for own in parts)
+    covariance = SensorBlocks.of(_averaged(weights, square))
+    precision = _averaged(weights, (own.precision for own in parts))
+    columns = {k: _averaged(weights, (own.columns[k] for own in parts)) for k in first.columns}
+    columns |= {k: own for k, own in covariance.contraction().items() if k in columns}
     flat, count = np.concatenate([z.reshape(-1, len(mean)) for z in drawn]), drawn[0][..., 0].size
     shares = np.repeat(weights / count, count)[:, None] + 0.0 * mean
     ends = 0.5 - INTERVAL / 2, 0.5 + INTERVAL / 2
@@ -303,11 +305,13 @@ def _summary(parts: list[Summary], first: Summary, drawn: list[Any], weights: An
         first,
         kind="mixture",
         mean=mean,
-        covariance=SensorBlocks.of(_averaged(weights, square)),
+        covariance=covariance,
         lower=lower,
         upper=upper,
-        columns={k: _averaged(weights, (own.columns[k] for own in parts)) for k in first.columns},
-        **averages,
+        gamma=np.clip(1.0 - precision * covariance.variance, 0.0, 1.0),  # a factor is no datum
+        precision=precision,
+        levels=_averaged(weights, (own.levels for own in parts)),
+        columns=columns,
     )
 
 
