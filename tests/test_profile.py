@@ -82,6 +82,7 @@ def test_a_height_on_two_sides_has_the_exact_moments(seed):
     assert (np.abs(mean - exact) < 0.1 * exact_sd).all()
     np.testing.assert_allclose(sd, exact_sd, rtol=0.05)
     assert "on which side height lies" in tree.attrs["message"]
+    assert tree.attrs["intervals"].startswith("a mixture of 2 answers, each: Laplace")
 
 
 def flat(seed):

@@ -286,6 +286,7 @@ def mixture_of(first: Posterior, parts: Sequence[Posterior], weights: np.ndarray
         hyper={k: _picked(weights, [own.hyper[k] for own in parts]) for k in first.hyper},
         precisions=precisions,
         variables=variables,
+        attrs={**first.attrs, "mixed_answers": float(len(parts))},
     )
 
 

@@ -170,6 +170,8 @@ def _attrs(answer: Answer) -> dict[str, Any]:
     intervals = "Laplace: every bias has a survey, so that no precision is estimated" if stated else intervals
     if found.kind == "Laplace" and answer.problem.model.tailed:
         intervals += "; each epoch's precision of the heavy-tailed process noise is held at its mean"
+    if (count := answer.posterior.attrs.get("mixed_answers")) is not None:
+        intervals = f"a mixture of {count:.0f} answers, each: {intervals}"
     # the date of time 0; nothing where times are no dates
     date = first_date(answer.problem.measurements.table)
     attrs = {
