@@ -253,6 +253,10 @@ MUTATIONS = [
     Mutation("slice(row, row + size), slice(row, row + width))) row += size", "slice(row, row + size), slice(row, row + width)))\n        row += width", "test_tails.py"),
     Mutation("* (n + 2) / n", "* n / (n + 2)", "test_assess.py"),
     Mutation("max(2.0 * np.sum(couples", "max(np.sum(couples", "test_assess.py"),
+    Mutation("by = -both / np", "by = both / np", "test_profile.py"),
+    Mutation("own.objective - max(one", "0 * own.objective - 0 * max(one", "test_profile.py"),
+    Mutation("precision * covariance.variance, 0.0, 1.0)", "0.9 * precision * covariance.variance, 0.0, 1.0)", "test_profile.py"),
+    Mutation("np.abs(np.log2(powers))", "np.abs(np.log(powers))", "test_assess.py"),
 ]  # fmt: skip
 
 
