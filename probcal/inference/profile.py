@@ -46,7 +46,7 @@ def profiled(answer: Answer, answered: Answered, monitor: Monitor) -> Answer:
     """The answer, or a mixture of those along a ridge or on two sides that fit about as well."""
     posterior, problem = answer.posterior, answer.problem
     known = answer.status.valid and posterior.sound and posterior.summary.covariance.whole
-    if not known or problem.model.rests or problem.model.biases > TILTED:
+    if monitor.stopped or not known or problem.model.rests or problem.model.biases > TILTED:
         return answer
     curves = [Curve.of(posterior, component) for component in _components(problem)]
     ridge = max(curves, key=lambda one: one.length, default=None)
