@@ -21,15 +21,32 @@ from pathlib import Path
 from time import perf_counter
 from unittest.mock import patch
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 from scipy.stats import beta
 
-from probcal import MAP, ConstantVelocity, Gaussian, Network, Node, Problem, Target, assess, fit, simulate
+from probcal import (
+    MAP,
+    Bias,
+    Channel,
+    ConstantVelocity,
+    Gaussian,
+    Network,
+    Node,
+    Problem,
+    RandomWalk,
+    Target,
+    assess,
+    fit,
+    sensor,
+    simulate,
+)
 from probcal.analysis.checks import CHECKS
 from probcal.cli.models import load_problem, load_truth
 from probcal.errors import FitError
+from probcal.geometry import norm
 from probcal.inference.fit import calibrate
 from probcal.labels import coordinates
 from probcal.results.read import each_track
@@ -108,6 +125,22 @@ def directions(run, places, free, path, motion):
     time = np.arange(float(len(path)))
     drawn = simulate(network, motion, time, key=run, share=1.0, tracks={"target": path})
     return Problem(network, motion, drawn.table), drawn.truth
+
+
+@sensor(range=Channel("m", std=0.035))
+def slant(target, pose, *, range_offset=Bias("m", 0.2)):
+    """Range to a target whose height is a state of its own."""
+    return dict(range=jnp.hypot(norm(target.position - pose.position), target.height - pose.height) + range_offset)
+
+
+def heights(run):
+    """Four anchors nearly in a plane; offsets and a height that hardly changes, drawn from their priors."""
+    places = [(-3, -3, 1.54), (3, -3, 1.60), (-3, 3, 1.66), (3, 3, 1.58)]
+    network = Network([slant.on(Node(f"a{k}", place[:2], height=place[2])) for k, place in enumerate(places)])
+    start = {"position": ((0, 0), 1.5), "velocity": ((0, 0), 0.2)}
+    motion = Target(ConstantVelocity(0.05) + RandomWalk("height", "m", 0.003, (1.6, 0.7)), start)
+    made = simulate(network, motion, np.arange(0, 40, 0.1), key=run)
+    return Problem(network, motion, made.table), made.truth
 
 
 def compact(run, start=None):
@@ -214,6 +247,7 @@ MOVED, TOLD = 5.0, 12.0  # sd by which a fault moves a bias, and by which the da
 NOISES = {"beacons": 0.1, "clocks": 0.05, "pass": 0.05, "bearings": 0.03, "signal": 0.05}
 NOTES = ("gain", "loo", "motion")  # kinds of findings that warn of nothing; smooth paths are not drawn from a motion
 RIGHT = {f"{name} own path": own(name, 0.3, noise) for name, noise in NOISES.items()}
+RIGHT["heights own path"] = heights
 RIGHT |= {f"{name} {share:g}": scene(name, share) for name in ("C1", "C2") for share in (0.3, 1.0)}
 SMOOTH = {f"{name} {share:g}": right(name, share) for name in NAMES for share in (0.3, 1.0)}
 WRONG = {

@@ -23,6 +23,7 @@ from probcal import (
 )  # fmt: skip
 from probcal.geometry import norm
 from probcal.inference import profile
+from probcal.results.modes import rivals
 
 PLACES = np.array([(-3.0, -3.0), (3.0, -3.0), (-3.0, 3.0), (3.0, 3.0)])
 HEIGHTS = np.array([1.54, 1.60, 1.66, 1.58])
@@ -82,6 +83,12 @@ def test_a_height_on_two_sides_has_the_exact_moments(seed):
     assert (np.abs(mean - exact) < 0.1 * exact_sd).all()
     np.testing.assert_allclose(sd, exact_sd, rtol=0.05)
     assert "on which side height lies" in tree.attrs["message"]
+    parts = tree["mode"].to_dataset().pipe(lambda group: group.isel(mode=group["kind"].values == "part"))
+    weight = np.exp(parts["gain"].values)
+    assert weight.sum() == pytest.approx(1)
+    assert all(str(name).startswith("height ") for name in parts["mode"].values)
+    np.testing.assert_allclose(weight @ parts["bias"].values, mean[:-1], rtol=1e-9)
+    assert not rivals(tree).sizes["mode"]
     assert tree.attrs["intervals"].startswith("a mixture of 2 answers, each: Laplace")
 
 

@@ -20,7 +20,7 @@ from probcal.modes.explore import SAME
 from probcal.problem import Problem
 from probcal.results.answer import Answer
 from probcal.results.build import build, modes_of
-from probcal.results.modes import AGAIN, REJECTED, apart
+from probcal.results.modes import AGAIN, PART, REJECTED, apart
 from probcal.results.schema import DIFFERENT
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def _watched(answer: Answer) -> Answer:
     for strained in strained_starts(problem, point) if answer.motion == "used" else ():
         found = found.judged(strained=strained)
     reported, *others = modes_of(answer)[0]
-    others = [other for other in others if other.kind not in (AGAIN, REJECTED)]
+    others = [other for other in others if other.kind not in (AGAIN, REJECTED, PART)]
     sd = answer.posterior.here[1] * problem.scales
     for other in others:
         away = apart(other.bias, reported.bias, sd)

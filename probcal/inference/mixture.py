@@ -1,8 +1,9 @@
-"""The posterior of a climb: a Gaussian, or where precisions are integrated a mixture of them."""
+"""The posterior of a climb: a Gaussian, or a mixture: over precisions, or of several answers."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
 from typing import Any
@@ -26,14 +27,15 @@ from probcal.results.answer import (
     Draws,
     Posterior,
     Summary,
+    Tracks,
     blocks_under,
     few_draws,
     precisions_of,
     tracks_at,
 )
 from probcal.results.blocks import SensorBlocks
-from probcal.results.schema import ROPE
-from probcal.simulate import derived_keys
+from probcal.results.schema import INTERVAL, ROPE
+from probcal.simulate import as_key, derived_keys
 
 
 def gaussian(
@@ -197,3 +199,94 @@ def mixture(
         chained=True,
         **known,
     )
+
+
+def mixture_of(first: Posterior, parts: Sequence[Posterior], weights: np.ndarray) -> Posterior:
+    """The mixture of posteriors by their weights (K,), expanded at the point of the first."""
+    drawn = [own.draws(as_key(0), ()).z for own in parts]
+
+    def moments(of_part: Sequence[Tracks]) -> Tracks:
+        mean = _averaged(weights, (own.mean for own in of_part))
+        square = _averaged(weights, (own.sd**2 + (own.mean - mean) ** 2 for own in of_part))
+        return Tracks(mean, np.sqrt(square))
+
+    def precisions() -> np.ndarray | None:
+        known = [own.precisions() if own.precisions else own.summary.precision for own in parts]
+        whole = [z * 0 + own for z, own in zip(drawn, known, strict=True) if own is not None]
+        return _picked(weights, whole) if len(whole) == len(parts) else None
+
+    variables = {
+        name: (dims, _picked(weights, [own.variables[name][1] for own in parts]), *coords)
+        for name, (dims, _, *coords) in first.variables.items()
+    }
+    return replace(
+        first,
+        summary=_summary([own.summary for own in parts], first.summary, drawn, weights),
+        draw=partial(_drawn, parts=tuple(parts), weights=weights),
+        moments=list(map(moments, zip(*(own.tracks() for own in parts), strict=True))),
+        hyper={k: _picked(weights, [own.hyper[k] for own in parts]) for k in first.hyper},
+        precisions=precisions,
+        variables=variables,
+    )
+
+
+def _summary(parts: list[Summary], first: Summary, drawn: list[Any], weights: Any) -> Summary:
+    """Moments of the mixture, and intervals of its draws."""
+    mean = _averaged(weights, (own.mean for own in parts))
+    square = (own.covariance.matrix() + np.outer(own.mean - mean, own.mean - mean) for own in parts)
+    covariance = SensorBlocks.of(_averaged(weights, square))
+    precision = _averaged(weights, (own.precision for own in parts))
+    columns = {k: _averaged(weights, (own.columns[k] for own in parts)) for k in first.columns}
+    columns |= {k: own for k, own in covariance.contraction().items() if k in columns}
+    flat, count = np.concatenate([z.reshape(-1, len(mean)) for z in drawn]), drawn[0][..., 0].size
+    shares = np.repeat(weights / count, count)[:, None] + 0.0 * mean
+    ends = 0.5 - INTERVAL / 2, 0.5 + INTERVAL / 2
+    lower, upper = np.quantile(flat, ends, axis=0, weights=shares, method="inverted_cdf")
+    return replace(
+        first,
+        kind="mixture",
+        mean=mean,
+        covariance=covariance,
+        lower=lower,
+        upper=upper,
+        gamma=np.clip(1.0 - precision * covariance.variance, 0.0, 1.0),  # a factor is no datum
+        precision=precision,
+        levels=_averaged(weights, (own.levels for own in parts)),
+        columns=columns,
+    )
+
+
+def _averaged(weights: np.ndarray, values: Iterable[Any]) -> np.ndarray:
+    """Mean of the values (...) of the parts (K) by their weights."""
+    return np.tensordot(weights, np.stack([np.asarray(value) for value in values]), 1)
+
+
+def _picked(weights: np.ndarray, values: Sequence[Any]) -> np.ndarray:
+    """Values (chain, draw, ...), each of one of the parts (K), as often as its weight says."""
+    found, shape = np.array(values[0]), np.shape(values[0])[:2]
+    order = np.random.default_rng(0).permutation(shape[0] * shape[1]).reshape(shape) + 0.5
+    part = np.searchsorted(np.cumsum(weights)[:-1] * order.size, order)
+    for k, own in enumerate(values):
+        found[part == k] = np.asarray(own)[part == k]
+    return found
+
+
+def _drawn(
+    _: Posterior,
+    key: jax.Array,
+    keep: tuple[str, ...],
+    *,
+    parts: Sequence[Posterior],
+    weights: np.ndarray,
+) -> Draws:
+    """Draws, each of one of the parts."""
+    drawn = [part.draws(key, keep) for part in parts]
+
+    def picked(name: str) -> list[np.ndarray]:
+        whole = zip(*(getattr(own, name) for own in drawn), strict=True)
+        return [_picked(weights, own) for own in whole]
+
+    z = _picked(weights, [own.z for own in drawn])
+    levels = _picked(weights, [own.levels for own in drawn])
+    states, likelihood, replicas = map(picked, ("states", "log_likelihood", "replicas"))
+    return Draws(z, levels, states, drawn[0].kept, likelihood, replicas)

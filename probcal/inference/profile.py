@@ -13,10 +13,8 @@ left to `modes`, which reports them.
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from probcal.gaussian.choose import engine_of
@@ -24,17 +22,15 @@ from probcal.gaussian.draws import residuals
 from probcal.gaussian.engine import Factors
 from probcal.gaussian.information import at_levels
 from probcal.gaussian.mode import Point
+from probcal.inference.mixture import mixture_of
 from probcal.inference.progress import Monitor, Stopped
 from probcal.labels import listed
 from probcal.linalg import pseudo_inverse
 from probcal.model.model import TILTED, Model, Tilt
-from probcal.modes.explore import MOST, SAME, SideClimb
+from probcal.modes.explore import MOST, SAME, Mirrored, SideClimb
 from probcal.modes.grid import follow_states
 from probcal.problem import Problem
-from probcal.results.answer import Answer, Draws, Posterior, Summary, Tracks
-from probcal.results.blocks import SensorBlocks
-from probcal.results.schema import INTERVAL
-from probcal.simulate import as_key
+from probcal.results.answer import Answer, Posterior, Tracks
 
 FAR = 1.5  # sds of the biases that a ridge goes at two sd of the tracks, from which it counts
 ALIKE = 0.25  # sds by which a mixture must move a mean, or widen its sd, to be another answer
@@ -55,36 +51,47 @@ def profiled(answer: Answer, answered: Answered, monitor: Monitor) -> Answer:
             monitor.enter(f"answers along {ridge.component}", answering=True)
             held = _held(answer, ridge, monitor)
             found = [own for place in held if (own := answered(*place)) is not None]
-            return _mixed(answer, found, f"The data hardly tell {ridge.component}")
+            return _mixed(answer, found, ridge, f"The data hardly tell {ridge.component}")
         for curve in curves:
             monitor.check()
             apart = curve.component.startswith("position")
             side = None if apart else _other_side(answer, curve)
             if side is not None and (own := answered(problem, side)) is not None:
                 why = f"The data do not tell on which side {curve.component} lies"
-                return _mixed(answer, [answer, own], why)
+                return _mixed(answer, [answer, own], curve, why)
     except Stopped:
         said = f"{monitor.stopped} before other answers were looked at"
         return answer.noted(f"{said}: intervals may be too short.")
     return answer
 
 
-def _mixed(answer: Answer, found: Sequence[Answer], why: str) -> Answer:
+def _mixed(answer: Answer, found: Sequence[Answer], curve: "Curve", why: str) -> Answer:
     """The answer with the mixture of those found, where that is another posterior than its own."""
     if len(found) < 2:
         return answer
     weights = np.exp([own.objective - max(one.objective for one in found) for own in found])
-    parts = [own.posterior for own in found]
-    mixed = mixture_of(answer.posterior, parts, weights / weights.sum())
+    weights /= weights.sum()
+    mixed = mixture_of(answer.posterior, [own.posterior for own in found], weights)
     pairs = list(zip(_moments(answer.posterior), _moments(mixed), strict=True))
     wider = [b.sd > (1 + ALIKE) * a.sd for a, b in pairs]
     moved = [abs(b.mean - a.mean) > ALIKE * a.sd for a, b in pairs]
     if not any(np.any(own) for own in (*wider, *moved)):
         return answer
+    kept = (_part(own, curve, weight) for own, weight in zip(found, weights, strict=True))
+    mixed = replace(mixed, parts=tuple(kept))
     labels = [answer.problem.labels[m] for m in np.flatnonzero(wider[0])]
     trades = f", which trades with {listed(labels, MOST)}" if labels else ""
     said = f"means, intervals and tracks are those of {len(found)} answers, weighed by evidence"
     return replace(answer, posterior=mixed).noted(f"{why}{trades}: {said}.")
+
+
+def _part(answer: Answer, curve: "Curve", weight: float) -> Mirrored:
+    """An answer as one of a mixture, named by where its tracks are along the component."""
+    point, summary = answer.posterior.point, answer.posterior.summary
+    pairs = answer.problem.model.each_layout(point.states, curve.shift)
+    place = np.median(np.concatenate([np.asarray(x)[shift > 0] for _, x, shift in pairs]))
+    name, gain = f"{curve.component} {place:.4g}", float(np.log(weight))
+    return Mirrored(name, gain, point, summary.mean, status=str(answer.status))
 
 
 def _moments(posterior: Posterior) -> list[Tracks]:
@@ -255,98 +262,3 @@ class _Line:
                 break
             away, top = max(2 * away, least), max(top, value)
         return away / 2
-
-
-# Mixtures
-
-
-def mixture_of(first: Posterior, parts: Sequence[Posterior], weights: np.ndarray) -> Posterior:
-    """The mixture of posteriors by their weights (K,), expanded at the point of the first."""
-    drawn = [own.draws(as_key(0), ()).z for own in parts]
-
-    def moments(of_part: Sequence[Tracks]) -> Tracks:
-        mean = _averaged(weights, (own.mean for own in of_part))
-        square = _averaged(weights, (own.sd**2 + (own.mean - mean) ** 2 for own in of_part))
-        return Tracks(mean, np.sqrt(square))
-
-    def precisions() -> np.ndarray | None:
-        known = [own.precisions() if own.precisions else own.summary.precision for own in parts]
-        whole = [z * 0 + own for z, own in zip(drawn, known, strict=True) if own is not None]
-        return _picked(weights, whole) if len(whole) == len(parts) else None
-
-    variables = {
-        name: (dims, _picked(weights, [own.variables[name][1] for own in parts]), *coords)
-        for name, (dims, _, *coords) in first.variables.items()
-    }
-    return replace(
-        first,
-        summary=_summary([own.summary for own in parts], first.summary, drawn, weights),
-        draw=partial(_drawn, parts=tuple(parts), weights=weights),
-        moments=list(map(moments, zip(*(own.tracks() for own in parts), strict=True))),
-        hyper={k: _picked(weights, [own.hyper[k] for own in parts]) for k in first.hyper},
-        precisions=precisions,
-        variables=variables,
-        attrs={**first.attrs, "mixed_answers": float(len(parts))},
-    )
-
-
-def _summary(parts: list[Summary], first: Summary, drawn: list[Any], weights: Any) -> Summary:
-    """Moments of the mixture, and intervals of its draws."""
-    mean = _averaged(weights, (own.mean for own in parts))
-    square = (own.covariance.matrix() + np.outer(own.mean - mean, own.mean - mean) for own in parts)
-    covariance = SensorBlocks.of(_averaged(weights, square))
-    precision = _averaged(weights, (own.precision for own in parts))
-    columns = {k: _averaged(weights, (own.columns[k] for own in parts)) for k in first.columns}
-    columns |= {k: own for k, own in covariance.contraction().items() if k in columns}
-    flat, count = np.concatenate([z.reshape(-1, len(mean)) for z in drawn]), drawn[0][..., 0].size
-    shares = np.repeat(weights / count, count)[:, None] + 0.0 * mean
-    ends = 0.5 - INTERVAL / 2, 0.5 + INTERVAL / 2
-    lower, upper = np.quantile(flat, ends, axis=0, weights=shares, method="inverted_cdf")
-    return replace(
-        first,
-        kind="mixture",
-        mean=mean,
-        covariance=covariance,
-        lower=lower,
-        upper=upper,
-        gamma=np.clip(1.0 - precision * covariance.variance, 0.0, 1.0),  # a factor is no datum
-        precision=precision,
-        levels=_averaged(weights, (own.levels for own in parts)),
-        columns=columns,
-    )
-
-
-def _averaged(weights: np.ndarray, values: Iterable[Any]) -> np.ndarray:
-    """Mean of the values (...) of the parts (K) by their weights."""
-    return np.tensordot(weights, np.stack([np.asarray(value) for value in values]), 1)
-
-
-def _picked(weights: np.ndarray, values: Sequence[Any]) -> np.ndarray:
-    """Values (chain, draw, ...), each of one of the parts (K), as often as its weight says."""
-    found, shape = np.array(values[0]), np.shape(values[0])[:2]
-    order = np.random.default_rng(0).permutation(shape[0] * shape[1]).reshape(shape) + 0.5
-    part = np.searchsorted(np.cumsum(weights)[:-1] * order.size, order)
-    for k, own in enumerate(values):
-        found[part == k] = np.asarray(own)[part == k]
-    return found
-
-
-def _drawn(
-    _: Posterior,
-    key: jax.Array,
-    keep: tuple[str, ...],
-    *,
-    parts: Sequence[Posterior],
-    weights: np.ndarray,
-) -> Draws:
-    """Draws, each of one of the parts."""
-    drawn = [part.draws(key, keep) for part in parts]
-
-    def picked(name: str) -> list[np.ndarray]:
-        whole = zip(*(getattr(own, name) for own in drawn), strict=True)
-        return [_picked(weights, own) for own in whole]
-
-    z = _picked(weights, [own.z for own in drawn])
-    levels = _picked(weights, [own.levels for own in drawn])
-    states, likelihood, replicas = map(picked, ("states", "log_likelihood", "replicas"))
-    return Draws(z, levels, states, drawn[0].kept, likelihood, replicas)

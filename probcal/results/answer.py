@@ -151,6 +151,8 @@ class Posterior:
     joint: Callable[[Point, Any], float] | None = None  # the log density that a sampler keeps of each draw
     chained: bool = False  # whether draws depend on each other
     held: bool = True  # whether noise levels are the same in every draw
+    # the answers that a mixture is of, with the logarithms of their weights
+    parts: tuple[Mirrored, ...] = ()
     # mean and sd (M,) on the heaviest side of a mirror, where draws lie on several
     side: tuple[np.ndarray, np.ndarray] | None = None
     zero: Point | None = None  # with all biases zero, where it is not the mode of the trajectories there

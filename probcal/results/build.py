@@ -28,7 +28,7 @@ from probcal.results.groups import (
     gather,
     track_groups,
 )
-from probcal.results.modes import AGAIN, ELSEWHERE, LEAST, REJECTED, REPORTED, ModeRow, mode_group, same_as
+from probcal.results.modes import AGAIN, ELSEWHERE, LEAST, PART, REJECTED, REPORTED, ModeRow, mode_group, same_as
 from probcal.results.schema import BOUND, EVIDENCE, INTERVAL, RESULTS_VERSION
 from probcal.table import first_date
 
@@ -170,8 +170,8 @@ def _attrs(answer: Answer) -> dict[str, Any]:
     intervals = "Laplace: every bias has a survey, so that no precision is estimated" if stated else intervals
     if found.kind == "Laplace" and answer.problem.model.tailed:
         intervals += "; each epoch's precision of the heavy-tailed process noise is held at its mean"
-    if (count := answer.posterior.attrs.get("mixed_answers")) is not None:
-        intervals = f"a mixture of {count:.0f} answers, each: {intervals}"
+    if count := len(answer.posterior.parts):
+        intervals = f"a mixture of {count} answers, each: {intervals}"
     # the date of time 0; nothing where times are no dates
     date = first_date(answer.problem.measurements.table)
     attrs = {
@@ -248,6 +248,9 @@ def modes_of(answer: Answer) -> tuple[list[ModeRow], list[Sequence[Any]]]:
         known = {"status": other.status} | started(other.point)
         modes.append(ModeRow(other.name, other.kind, mean + other.shift * scales, other.gain, **known))
         states.append(other.point.states)
+    for own in posterior.parts:
+        modes.append(ModeRow(own.name, PART, own.shift * scales, own.gain, own.status))
+        states.append(own.point.states)
     for k, one in sorted(optima.items(), key=lambda item: -item[1].objective):
         bias = one.posterior.here[0] * scales
         gain = one.objective - answer.objective if one.method == answer.method else np.nan

@@ -14,6 +14,7 @@ from probcal.results.schema import DIFFERENT, RESULTS_VERSION, evidence_in
 REPORTED = "reported"  # kind of the answer that the rest of the tree describes
 AGAIN = "again"  # kind of an answer from a further start that stands before it in the group
 REJECTED = "rejected"  # kind of another answer from a further start, far below the reported one or invalid
+PART = "part"  # kind of an answer that the reported mixture is of; `gain` is its log weight
 ELSEWHERE = "found from another start"
 LEAST = 0.01  # scales that count as an sd where that is smaller
 
@@ -22,7 +23,7 @@ class ModeRow(NamedTuple):
     """One answer of a fit."""
 
     name: str  # of what was reflected or exchanged
-    kind: str  # that, or "scene", "piece", "node", "start": by what it differs from the reported one
+    kind: str  # that, or "scene", "piece", "node", "start", "part": by what it differs from the reported one
     bias: np.ndarray  # (M,) in its unit
     gain: float = np.nan  # evidence or log density less that of the reported one, nats
     status: str = ""  # of the fit from there; empty where it was found only
@@ -69,7 +70,7 @@ def rivals(tree: xr.DataTree) -> xr.Dataset:
     """The other answers that fit about as well as the reported one; `number` is their row."""
     group = modes_in(tree)
     group = group.assign(number=("mode", np.arange(group.sizes["mode"])))
-    return group.isel(mode=~np.isin(group["kind"].values, (REPORTED, AGAIN, REJECTED)))
+    return group.isel(mode=~np.isin(group["kind"].values, (REPORTED, AGAIN, REJECTED, PART)))
 
 
 def alike(tree: xr.DataTree) -> xr.Dataset:

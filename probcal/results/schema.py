@@ -2,8 +2,9 @@
 
 Group `mode` (dimension `mode`) has all answers of a fit, the reported one first: its name, `kind`
 ("reported"; "scene", "piece", "node" or "start" of another answer, by what it differs; "again" of a
-further start that came back to one of them; "rejected" of one that ended far below or invalid),
-`gain` (evidence or log density less that of the reported answer, nats), `bias` and `apart` (its
+further start that came back to one of them; "rejected" of one that ended far below or invalid;
+"part" of an answer that the reported mixture is of), `gain` (evidence or log density less that of
+the reported answer, nats; of a part the logarithm of its weight), `bias` and `apart` (its
 distance in sd) by bias, `status` of the fit from there (empty where the answer was found and not
 fitted), `start` (the number of the start that led to it, -1 of none) and its `objective`. An answer
 whose gain is above minus the attribute `same` fits as well. Of several answers
