@@ -82,7 +82,8 @@ def _mixed(answer: Answer, found: Sequence[Answer], curve: "Curve", why: str) ->
     labels = [answer.problem.labels[m] for m in np.flatnonzero(wider[0])]
     trades = f", which trades with {listed(labels, MOST)}" if labels else ""
     said = f"means, intervals and tracks are those of {len(found)} answers, weighed by evidence"
-    return replace(answer, posterior=mixed).noted(f"{why}{trades}: {said}.")
+    told = f"declare a closer start of {curve.component} where one is known"
+    return replace(answer, posterior=mixed).noted(f"{why}{trades}: {said}; {told}.")
 
 
 def _part(answer: Answer, curve: "Curve", weight: float) -> Mirrored:
