@@ -41,7 +41,8 @@ Answered = Callable[[Problem, Point], Answer | None]  # of a method, if there is
 def profiled(answer: Answer, answered: Answered, monitor: Monitor) -> Answer:
     """The answer, or a mixture of those along a ridge or on two sides that fit about as well."""
     posterior, problem = answer.posterior, answer.problem
-    known = answer.status.valid and posterior.sound and posterior.summary.covariance.whole
+    known = answer.status.valid and posterior.sound and answer.prior.proper
+    known = known and posterior.summary.covariance.whole
     if monitor.stopped or not known or problem.model.rests or problem.model.biases > TILTED:
         return answer
     curves = [Curve.of(posterior, component) for component in _components(problem)]
