@@ -20,7 +20,7 @@ from probcal import (
     RandomWalk,
     Target,
     sensor,
-)  # fmt: skip
+)
 from probcal.geometry import norm
 from probcal.inference import profile
 from probcal.results.modes import rivals
@@ -93,16 +93,13 @@ def test_a_height_on_two_sides_has_the_exact_moments(seed):
 
 
 def flat(seed):
-    """Four anchors nearly in a plane, a tag half a metre off it, offsets and height drawn from their priors."""
+    """Four anchors nearly in a plane, a tag half a metre off it, offsets drawn from their prior."""
     rng, times = np.random.default_rng(1000 + seed), np.arange(0, 40, 0.1)
     offsets, height = rng.normal(0, SCALE, 4), 1.6 + 0.5 * rng.choice([-1, 1])
     path = np.stack([1.6 * np.cos(times / 3), 1.6 * np.sin(times / 3) + 0.2 * np.sin(times / 1.1)], 1)
     network, table = recording(range(4), path, times, height, offsets, seed)
-    return (
-        Problem(network, ConstantVelocity(0.15) + RandomWalk("height", "m", 0.003, (1.6, 0.7)), table),
-        offsets,
-        height,
-    )
+    motion = ConstantVelocity(0.15) + RandomWalk("height", "m", 0.003, (1.6, 0.7))
+    return Problem(network, motion, table), offsets
 
 
 @pytest.mark.ci
