@@ -1,7 +1,7 @@
 """Power scaling: how prior and likelihood move each posterior (Kallioinen et al. 2024).
 
-The numbers of `arviz_stats.psense`, for all biases in arrays: ArviZ takes longer to load than a fit
-is checked.
+The numbers of `arviz_stats.psense`, in arrays for all biases, without the seconds that ArviZ takes
+to load.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def check_scaling(case: Case) -> Checked:
 
 
 def _distance(draws: np.ndarray, log_density: np.ndarray) -> np.ndarray:
-    """Sensitivity (M,) of draws (draw, M) to powers of a density (draw,): distance a log2 of them.
+    """Sensitivity (M,) of draws (draw, M) to powers of a density (draw,): distance a doubling.
 
     Distances are those of the draws as they are and as weighted by the power, the larger one of either direction.
     """
