@@ -19,7 +19,7 @@ from probcal.labels import NOBODY
 from probcal.lazy import pd
 from probcal.linalg import handedness
 from probcal.model.epochs import Epoch, merged
-from probcal.model.model import TILTED, Mixing, Model, Recursion, Tail, Tilt, at_rest
+from probcal.model.model import TILTED, Mixing, Model, Recursion, Spot, Tail, Tilt, at_rest
 from probcal.model.motions import (
     CLEAR,
     DIFFUSE,
@@ -470,6 +470,11 @@ class Problem:
     def at_measured(self) -> Problem:
         """The same problem with growing stds at the measured values, for starts; itself where none grows."""
         return self if (model := at_measured(self.model)) is self.model else self._with(model=model)
+
+    def with_start(self, where: Spot, value: float, sd: float) -> tuple[Problem, float]:
+        """The same problem with a measurement of a first state, and the log density of that."""
+        model, density = self.model.with_start(where, value, sd)
+        return self._with(model=model), density
 
     def with_mixing(self, weights: Mixing) -> Problem:
         """The same problem with other precisions (E,) of the process noises that are not Gaussian."""

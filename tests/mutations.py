@@ -254,7 +254,11 @@ MUTATIONS = [
     Mutation("* (n + 2) / n", "* n / (n + 2)", "test_assess.py"),
     Mutation("max(2.0 * np.sum(couples", "max(np.sum(couples", "test_assess.py"),
     Mutation("by = -both / np", "by = both / np", "test_profile.py"),
-    Mutation("own.objective - max(one", "0 * own.objective - 0 * max(one", "test_profile.py"),
+    Mutation("weights = np.exp(worth - worth.max())", "weights = np.exp(0.0 * worth)", "test_profile.py"),
+    Mutation("drift[epoch] += spread * away / total", "drift[epoch] -= spread * away / total", "test_profile.py"),
+    Mutation("(total + sd * np.sqrt(total))", "total", "test_profile.py"),
+    Mutation("own.objective + density if line", "own.objective if line", "test_profile.py"),
+    Mutation("waiting[0] ^ change for change in changes", "waiting[0] ^ change for change in changes[:0]", "test_profile.py"),
     Mutation("precision * covariance.variance, 0.0, 1.0)", "0.9 * precision * covariance.variance, 0.0, 1.0)", "test_profile.py"),
     Mutation("np.abs(np.log2(powers))", "np.abs(np.log(powers))", "test_assess.py"),
 ]  # fmt: skip

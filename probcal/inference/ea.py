@@ -94,7 +94,9 @@ def _settled(model: Model, prior: Prior, given: Given, state: State, mode: Mode,
     # on a cusp, where a target grazes a sensor, and where rounding hides what is left, no step lowers the cost
     nothing = still & (mode.gained < given.tolerance)
     learns = prior.learns or model.learns_noise
-    done = nothing | (mode.converged & still if learns else mode.converged)
+    # on a kink of the density, where tracks leave a plane of all sensors to either side
+    kink = (mode.gained < GAIN / 5) & (jnp.abs(objective - state.objective) < GAIN / 5)
+    done = nothing | (mode.converged & still if learns else mode.converged | kink)
     done = done | jnp.any(astray(prior, mode.point.z, given.surveyed))  # it diverged: no further step helps
     refused = state.refused & mode.refused
     state = state._replace(point=mode.point, objective=objective, refused=refused, done=done)

@@ -3,21 +3,21 @@
 Tracks near the plane of all anchors, say, tell their height by its square only, and a common
 offset of the ranges makes up for that: the posterior is a long ridge, and its mode, at the plane,
 seems sure. What rows change by to second order, when all tracks are shifted along one component of
-their state, tells such a ridge (Bates and Watts 1980): the biases that make up for it are its
-direction u. The biases are held along u by Gaussian factors at equal steps, the method answers
-under each, and these answers are weighed by their evidence, as INLA does over its grid (Rue,
-Martino and Chopin 2009); factors of an sd of half a step add up to one. Off the plane the height
-has two modes, where the second order undoes the first: both are answered. Reflected positions are
-left to `modes`, which reports them.
+their state, tells such a ridge (Bates and Watts 1980). There the first state of a target is held
+by Gaussian factors at equal steps, the method answers under each, and these answers are weighed by
+their evidence, as INLA does over its grid (Rue, Martino and Chopin 2009); factors of an sd of half
+a step add up to one. Off the plane each height has two modes, where the second order undoes the
+first: targets change sides one by one, and what fits about as well is answered. Reflected
+positions are left to `modes`, which reports them.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from probcal.gaussian.choose import engine_of
+from probcal.gaussian.choose import choose, engine_of
 from probcal.gaussian.draws import residuals
 from probcal.gaussian.engine import Factors
 from probcal.gaussian.information import at_levels
@@ -26,8 +26,8 @@ from probcal.inference.mixture import mixture_of
 from probcal.inference.progress import Monitor, Stopped
 from probcal.labels import listed
 from probcal.linalg import pseudo_inverse
-from probcal.model.model import TILTED, Model, Tilt
-from probcal.modes.explore import MOST, SAME, Mirrored, SideClimb
+from probcal.model.model import Model, Spot
+from probcal.modes.explore import MOST, NEAR, SAME, Mirrored, SideClimb
 from probcal.modes.grid import follow_states
 from probcal.problem import Problem
 from probcal.results.answer import Answer, Posterior, Tracks
@@ -40,38 +40,51 @@ Answered = Callable[[Problem, Point], Answer | None]  # of a method, if there is
 
 def profiled(answer: Answer, answered: Answered, monitor: Monitor) -> Answer:
     """The answer, or a mixture of those along a ridge or on two sides that fit about as well."""
-    posterior, problem = answer.posterior, answer.problem
-    known = answer.status.valid and posterior.sound and answer.prior.proper
-    known = known and posterior.summary.covariance.whole
-    if monitor.stopped or not known or problem.model.rests or problem.model.biases > TILTED:
+    problem, known = answer.problem, answer.status.valid and answer.posterior.sound
+    known = known and answer.prior.proper and answer.posterior.summary.covariance.whole
+    if monitor.stopped or not known or problem.model.rests or not choose(problem.model).cheap:
         return answer
-    curves = [Curve.of(posterior, component) for component in _components(problem)]
-    ridge = max(curves, key=lambda one: one.length, default=None)
     try:
+        sides, told = [answer], ""
+        for component in _components(problem):
+            while not component.startswith("position"):
+                found = _sides(answer, Curve.of(answer.posterior, component), answered, monitor)
+                sides, told = (found, component) if len(found) > 1 else (sides, told)
+                if found[0] is answer:
+                    break
+                answer = sides[0] = _instead(answer, found[0])
+        curves = [Curve.of(answer.posterior, component) for component in _components(problem)]
+        ridge = max(curves, key=lambda one: one.length, default=None)
         if ridge is not None and ridge.length > FAR:
             monitor.enter(f"answers along {ridge.component}", answering=True)
-            held = _held(answer, ridge, monitor)
-            found = [own for place in held if (own := answered(*place)) is not None]
-            return _mixed(answer, found, ridge, f"The data hardly tell {ridge.component}")
-        for curve in curves:
-            monitor.check()
-            apart = curve.component.startswith("position")
-            side = None if apart else _other_side(answer, curve)
-            if side is not None and (own := answered(problem, side)) is not None:
-                why = f"The data do not tell on which side {curve.component} lies"
-                return _mixed(answer, [answer, own], curve, why)
+            parts = _along(answer, ridge, sides[:MOST], answered)
+            return _mixed(answer, parts, ridge, f"The data hardly tell {ridge.component}")
+        if len(sides) > 1:
+            apart = [_Part(0, one, one.objective) for one in sides]
+            curve = next(one for one in curves if one.component == told)
+            return _mixed(answer, apart, curve, f"The data do not tell on which side {told} lies")
     except Stopped:
         said = f"{monitor.stopped} before other answers were looked at"
         return answer.noted(f"{said}: intervals may be too short.")
     return answer
 
 
-def _mixed(answer: Answer, found: Sequence[Answer], curve: "Curve", why: str) -> Answer:
+def _instead(answer: Answer, better: Answer) -> Answer:
+    """A better answer with what was found around the first one."""
+    gain = better.objective - answer.objective
+    moved = answer.posterior.summary.mean - better.posterior.summary.mean
+    mirrors = (m._replace(gain=m.gain - gain, shift=m.shift + moved) for m in answer.mirrors)
+    kept: Any = dict(motion=answer.motion, optima=answer.optima, best=answer.best)
+    return replace(better, mirrors=tuple(mirrors), **kept)
+
+
+def _mixed(answer: Answer, parts: Sequence["_Part"], curve: "Curve", why: str) -> Answer:
     """The answer with the mixture of those found, where that is another posterior than its own."""
-    if len(found) < 2:
+    if len(parts) < 2:
         return answer
-    weights = np.exp([own.objective - max(one.objective for one in found) for own in found])
-    weights /= weights.sum()
+    worth = np.array([part.worth for part in parts])
+    weights = np.exp(worth - worth.max())
+    weights, found = weights / weights.sum(), [part.answer for part in parts]
     mixed = mixture_of(answer.posterior, [own.posterior for own in found], weights)
     pairs = list(zip(_moments(answer.posterior), _moments(mixed), strict=True))
     wider = [b.sd > (1 + ALIKE) * a.sd for a, b in pairs]
@@ -111,9 +124,7 @@ class Curve(NamedTuple):
     shift: tuple[np.ndarray, ...]  # (E, n) of each recursion: two sd, the median one of each target
     first: tuple[np.ndarray, ...]  # (N, C) of each block, by how much at a shift to first order
     second: tuple[np.ndarray, ...]  # (N, C) to second order
-    along: np.ndarray  # (M,) biases that make up for the second order, tracks following
-    functional: np.ndarray  # (M,) whose product with biases is their place along these
-    length: float  # of these, in sds
+    length: float  # of the biases that make up for the second order, tracks following, in sds
 
     @classmethod
     def of(cls, posterior: Posterior, component: str) -> "Curve":
@@ -133,16 +144,18 @@ class Curve(NamedTuple):
         pulled = engine_of("dense", at.model).at(at.model, at.point, tuple(rows))
         slope = np.asarray(pulled.slope()) - np.asarray(at.slope())
         along = np.asarray(at.solve(Factors.alone(summary.precision), slope))
-        weighed = pseudo_inverse(summary.covariance.matrix(), symmetric=True) @ along
-        square = max(float(along @ weighed), np.finfo(float).tiny)
-        functional = weighed / square
-        return cls(component, shift, tuple(first), tuple(second), along, functional, square**0.5)
+        inverse = pseudo_inverse(summary.covariance.matrix(), symmetric=True)
+        length = max(float(along @ inverse @ along), 0.0) ** 0.5
+        return cls(component, shift, tuple(first), tuple(second), length)
 
-    def apart(self, model: Model, a: Point, b: Point) -> bool:
-        """Whether the tracks of two points lie more than a shift apart."""
-        pairs = model.each_layout(a.states, b.states, self.shift)
-        square = [np.sum((np.asarray(x) - y)[s > 0] ** 2) - np.sum(s**2) for _, x, y, s in pairs]
-        return sum(square) > 0
+    def apart(self, problem: Problem, a: Point, b: Point) -> bool:
+        """Whether the track of a target lies more than a shift apart at two points."""
+        pairs = problem.model.each_layout(problem.epochs, a.states, b.states, self.shift)
+        return any(
+            np.sum((np.asarray(x) - y)[mine] ** 2 * (shift[mine] > 0)) > np.sum(shift[mine] ** 2)
+            for _, epochs, x, y, shift in pairs
+            for mine in epochs.members.values()
+        )
 
 
 def _components(problem: Problem) -> list[str]:
@@ -177,90 +190,155 @@ def _followed(problem: Problem, point: Point, shift: Iterable[np.ndarray], by: f
     return at_levels(problem.model, moved._replace(z=point.z), point.levels)
 
 
-# The other side
+# Other sides
 
 
-def _other_side(answer: Answer, curve: Curve) -> Point | None:
-    """The mode where the second order undoes the first, if that fits about as well."""
+def _sides(answer: Answer, curve: Curve, answered: Answered, monitor: Monitor) -> list[Answer]:
+    """The answers that fit about as well where the second order undoes the first, the best first.
+
+    Targets change sides one by one, from the best place on.
+    """
     problem, here = answer.problem, answer.posterior.point
-    by = _undone(answer.posterior, curve)
-    if not any(np.any(own) for own in by):
-        return None
-    shift = (own[:, None] * whole for own, whole in zip(by, curve.shift, strict=True))
+    ways, found = _undone(answer.posterior, curve), [answer]
     climb = SideClimb.on(problem, engine_of("dense", problem.model))
-    (here, first), (there, second) = map(climb.mode, (here, _followed(problem, here, shift, 1.0)))
-    alike = climb.evidence(there, second) > climb.evidence(here, first) - SAME
-    return there if alike and curve.apart(problem.model, here, there) else None
+    known, seen = dict[frozenset[int], tuple[Point, float]](), set[frozenset[int]]()
+
+    def near(nats: float) -> list[frozenset[int]]:
+        least = max(value for _, value in known.values()) - nats
+        within = (one for one in known if known[one][1] > least)
+        return sorted(within, key=lambda one: -known[one][1])
+
+    def add(side: frozenset[int], start: Point) -> None:
+        monitor.check()
+        point, value = climb.mode(start)
+        alike = any(not curve.apart(problem, point, other) for other, _ in known.values())
+        known[side] = point, -np.inf if alike else climb.evidence(point, value)
+
+    if ways:
+        add(frozenset(), here)
+    changes = [*map(frozenset, {(k,) for k in range(len(ways))} | {tuple(range(len(ways)))})]
+    while ways and len(known) < 16 * MOST:
+        waiting = [one for one in near(NEAR) if one not in seen]
+        if not waiting:
+            break
+        seen.add(waiting[0])
+        for other in (waiting[0] ^ change for change in changes):
+            if other and other not in known:
+                moved = zip(*(ways[t] for t in other), strict=True)
+                shift = (sum(own, start=np.zeros(1)) for own in moved)
+                add(other, _followed(problem, here._replace(z=known[waiting[0]][0].z), shift, 1.0))
+    for side in near(SAME)[: 2 * MOST] if ways else []:
+        if side and (own := answered(problem, known[side][0])) is not None:
+            found.append(own)
+    return sorted(found, key=lambda one: -one.objective)
 
 
-def _undone(posterior: Posterior, curve: Curve) -> list[np.ndarray]:
-    """Shifts (E,) of each recursion then; 0 for targets whose rows would not stay as they are."""
+def _undone(posterior: Posterior, curve: Curve) -> list[list[np.ndarray]]:
+    """Shifts (E, n) of each recursion then, of each target whose rows stay as they are by half."""
+    problem, found = posterior.problem, []
+    for r, (first, both, second) in enumerate(_sums(posterior, curve)):
+        by = -both / np.where(second > 0, second, np.inf)
+        left = first + 2 * by * both + by**2 * second
+        for mine in problem.epochs[r].members.values():
+            if (mine & (abs(by) > 1) & (left < 0.5 * first)).any():
+                shifts = [np.zeros_like(own) for own in curve.shift]
+                shifts[r][mine] = by[mine, None] * curve.shift[r][mine]
+                found.append(shifts)
+    return found
+
+
+def _sums(posterior: Posterior, curve: Curve) -> list[np.ndarray]:
+    """Weighed squares (3, E) of the rows of each target: of the first order, both, the second."""
     problem, at = posterior.problem, posterior.expansion
     sums = [np.zeros((3, len(epochs.time))) for epochs in problem.epochs]
     for _, rows, r, lin, a, b in at.model.each_block(at.rows, curve.first, curve.second):
         for whole, product in zip(sums[r], (a * a, a * b, b * b), strict=True):
             np.add.at(whole, np.asarray(rows.epoch), (np.asarray(lin.weight) * product).sum(1))
-    found = []
     for _, epochs, own in at.model.each_layout(problem.epochs, sums):
         for mine in epochs.members.values():
             own[:, mine] = own[:, mine].sum(1, keepdims=True)
-        first, both, second = own
-        by = -both / np.where(second > 0, second, np.inf)
-        left = first + 2 * by * both + by**2 * second
-        found.append(np.where((abs(by) > 1) & (left < 0.2 * first), by, 0.0))
-    return found
+    return sums
 
 
 # A ridge
 
 
-def _held(answer: Answer, curve: Curve, monitor: Monitor) -> Iterator[tuple[Problem, Point]]:
-    """Problems held along a ridge, with each of their modes that fits about as well as the best."""
-    line, least = _Line(answer, curve), 2.0 / curve.length
-    low, high = (line.reach(sign, least, monitor) for sign in (-1, 1))
-    step = max(least, (low + high) / 5)  # at most ten answers, of two sides each
-    for k in range(-round(low / step), round(high / step) + 1):
-        held, modes = line.modes(k * step, step / 2)
-        kept = list[Point]()
-        for point, value in modes:
-            monitor.check()
-            new = not any(not curve.apart(held.model, point, other) for other in kept)
-            if new and value > modes[0][1] - SAME:
-                kept.append(point)
-                yield held, point
+class _Part(NamedTuple):
+    """An answer with a first state held."""
 
-
-@dataclass(frozen=True)
-class _Line:
-    """Places along a ridge, numbered by squares of shifts from the answer."""
-
+    k: int  # number of its place
     answer: Answer
-    curve: Curve
+    worth: float  # logarithm of its weight
 
-    def modes(self, away: float, sd: float) -> tuple[Problem, list[tuple[Point, float]]]:
-        """The problem held at a place within an sd; its modes and their evidence, the best first.
 
-        They are climbed to from tracks as they are, and as far to both sides as the place asks.
-        """
-        point, curve, problem = self.answer.posterior.point, self.curve, self.answer.problem
-        z, along = np.asarray(point.z) + away * curve.along, curve.functional
-        curvature = np.outer(along, along) / sd**2
-        held = problem.with_tilt(Tilt(z, np.zeros(()), np.zeros(len(z)), curvature))
-        climb = SideClimb.on(held, engine_of("dense", held.model))
-        starts = [
-            _followed(problem, point._replace(z=z), curve.shift, side * abs(away) ** 0.5)
-            for side in ((0, 1, -1) if away > 0 else (0,))
-        ]
-        found = [(own, climb.evidence(own, value)) for own, value in map(climb.mode, starts)]
-        return held, sorted(found, key=lambda one: -one[1])
+def _along(answer: Answer, curve: Curve, sides: list[Answer], answered: Answered) -> list[_Part]:
+    """Answers at equal steps of a first state, from each side, until each way fits worse."""
+    line, found = _Line.of(answer, curve), list[_Part]()
 
-    def reach(self, sign: int, least: float, monitor: Monitor) -> float:
-        """Length of the ridge until the evidence falls by `SAME` nats, in steps that double."""
-        away, top = 0.0, -np.inf
-        while away < least * 2.0**12:
-            monitor.check()
-            value = self.modes(sign * away, least / 2)[1][0][1]
-            if value < top - SAME:
-                break
-            away, top = max(2 * away, least), max(top, value)
-        return away / 2
+    def reached(k: int, start: Point) -> _Part | None:
+        """The answer at a place, where the way goes on from it."""
+        problem, density = line.held(k)
+        own = answered(problem, _followed(problem, start, curve.shift, 0.0))
+        if own is None:
+            return None
+        places = [one.answer.posterior.point for one in found if one.k == k]
+        if not all(curve.apart(problem, own.posterior.point, place) for place in places):
+            return None
+        worth = own.objective + density if line.follows(own.posterior.point) else -np.inf
+        found.append(part := _Part(k, own, worth))
+        return part if part.worth > max(one.worth for one in found) - SAME else None
+
+    for side in sides:
+        start = side.posterior.point
+        middle = reached(line.number(start), start)
+        for sign in (1, -1):
+            part = middle
+            while part is not None:
+                part = reached(part.k + sign, part.answer.posterior.point)
+    follows = np.isfinite([one.worth for one in found]).all()
+    return found if follows else []  # the track leaves such a start
+
+
+class _Line(NamedTuple):
+    """Places of the first state of one target, numbered from an answer."""
+
+    problem: Problem
+    where: Spot  # recursion, epoch and entry of the state
+    values: np.ndarray  # in the answer, its own and the median of its track
+    step: float
+
+    @classmethod
+    def of(cls, answer: Answer, curve: Curve) -> "_Line":
+        """Of the target that the second order changes most, by two sds of the biases a step."""
+        problem, point = answer.problem, answer.posterior.point
+        sums = (own[2] for own in _sums(answer.posterior, curve))
+        _, r, epoch, entry = max(
+            (own[epoch], r, epoch, entry)
+            for r, (part, own, shift) in enumerate(problem.model.each_layout(sums, curve.shift))
+            for epoch, entry in np.argwhere(np.asarray(part.first)[:, None] & (shift > 0))
+        )
+        step = float(curve.shift[r][epoch, entry]) * (2.0 / curve.length) ** 0.5
+        where = r, epoch, entry
+        return cls(problem, where, _first_and_median(problem, where, point), step)
+
+    def number(self, point: Point) -> int:
+        """Of the place next to a point."""
+        first, _ = _first_and_median(self.problem, self.where, point) - self.values
+        return round(first / self.step)
+
+    def follows(self, point: Point) -> bool:
+        """Say whether the middle of the track has gone with the first state."""
+        first, middle = _first_and_median(self.problem, self.where, point) - self.values
+        return abs(middle - first) <= 0.5 * abs(first) + 0.1 * self.step
+
+    def held(self, k: int) -> tuple[Problem, float]:
+        """The problem held at a place, and the log density that its evidence lacks."""
+        return self.problem.with_start(self.where, self.values[0] + k * self.step, self.step / 2)
+
+
+def _first_and_median(problem: Problem, where: Spot, point: Point) -> np.ndarray:
+    """An entry of the first state of a target, and its median along the track."""
+    r, epoch, entry = where
+    mine = next(own for own in problem.epochs[r].members.values() if own[epoch])
+    track = np.asarray(point.states[r])[mine, entry]
+    return np.array([track[0], np.median(track)])

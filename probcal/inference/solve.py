@@ -121,7 +121,12 @@ def solve_timed(
     try:
         ran = cast("Maximiser", found.method)
         found = first = _beside_mirrors(found, ran, context)
-        return profiled(first, lambda held, point: _like_first(first, held, ran, point, context), monitor)
+
+        def answered(held: Problem, point: Point) -> Answer | None:
+            monitor.check()
+            return _like_first(first, held, ran, point, context)
+
+        return profiled(first, answered, monitor)
     except MemoryError:
         return found.noted("Memory did not hold what looking at other answers takes.")
 

@@ -75,6 +75,7 @@ class Tail:
         return jnp.sum(u[:, slice(*self.columns)] ** 2, 1) / self.weight
 
 
+Spot = tuple[int, int, int]  # a recursion, an epoch and an entry of the state
 TILTED = 200  # biases up to which the curvature of a tilt is worked out, and memory for one is kept
 
 
@@ -455,6 +456,24 @@ class Model(Stepwise):
     def with_tilt(self, tilt: Tilt) -> "Model":
         """The model with a term of the log-likelihood of the biases beside that of the rows."""
         return replace(self, tilt=tilt)
+
+    def with_start(self, where: Spot, value: float, sd: float) -> tuple["Model", float]:
+        """The model with a measurement of a first state, and the log density of that.
+
+        The factor of the start is updated as by Potter (1963).
+        """
+        r, epoch, entry = where
+        part = self.recursions[r]
+        L, drift = np.array(part.L), np.array(part.drift)
+        own, away = L[epoch, entry].copy(), value - drift[epoch, entry]
+        total = own @ own + sd**2
+        spread = L[epoch] @ own
+        drift[epoch] += spread * away / total
+        L[epoch] -= np.outer(spread, own) / (total + sd * np.sqrt(total))
+        known = part._replace(L=jnp.asarray(L), drift=jnp.asarray(drift))
+        parts = (*self.recursions[:r], known, *self.recursions[r + 1 :])
+        density = -0.5 * (away**2 / total + np.log(2 * np.pi * total))
+        return replace(self, recursions=parts), float(density)
 
     def with_mixing(self, weights: Mixing) -> "Model":
         """The model with other precisions of its process noise, where this is not Gaussian."""
