@@ -133,12 +133,13 @@ def slant(target, pose, *, range_offset=Bias("m", 0.2)):
     return dict(range=jnp.hypot(norm(target.position - pose.position), target.height - pose.height) + range_offset)
 
 
-def heights(run):
-    """Four anchors nearly in a plane; offsets and a height that hardly changes, drawn from their priors."""
+def heights(run, targets=1):
+    """Four anchors nearly in a plane; offsets and heights that hardly change, drawn from their priors."""
     places = [(-3, -3, 1.54), (3, -3, 1.60), (-3, 3, 1.66), (3, 3, 1.58)]
     network = Network([slant.on(Node(f"a{k}", place[:2], height=place[2])) for k, place in enumerate(places)])
     start = {"position": ((0, 0), 1.5), "velocity": ((0, 0), 0.2)}
     motion = Target(ConstantVelocity(0.05) + RandomWalk("height", "m", 0.003, (1.6, 0.7)), start)
+    motion = {f"tag{k}": motion for k in range(targets)} if targets > 1 else motion
     made = simulate(network, motion, np.arange(0, 40, 0.1), key=run)
     return Problem(network, motion, made.table), made.truth
 

@@ -277,6 +277,8 @@ def _along(answer: Answer, curve: Curve, sides: list[Answer], answered: Answered
 
     def reached(k: int, start: Point) -> _Part | None:
         """The answer at a place, where the way goes on from it."""
+        if len(found) == 16 * MOST:  # of what nothing bounds
+            return None
         problem, density = line.held(k)
         own = answered(problem, _followed(problem, start, curve.shift, 0.0))
         if own is None:
