@@ -258,7 +258,7 @@ MUTATIONS = [
     Mutation("drift[epoch] += spread * away / total", "drift[epoch] -= spread * away / total", "test_profile.py"),
     Mutation("(total + sd * np.sqrt(total))", "total", "test_profile.py"),
     Mutation("own.objective + density if line", "own.objective if line", "test_profile.py"),
-    Mutation("waiting[0] ^ change for change in changes", "waiting[0] ^ change for change in changes[:0]", "test_profile.py"),
+    Mutation("side ^ change for change in changes", "side ^ change for change in changes[:0]", "test_profile.py"),
     Mutation("precision * covariance.variance, 0.0, 1.0)", "0.9 * precision * covariance.variance, 0.0, 1.0)", "test_profile.py"),
     Mutation("np.abs(np.log2(powers))", "np.abs(np.log(powers))", "test_assess.py"),
 ]  # fmt: skip

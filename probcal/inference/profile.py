@@ -45,11 +45,12 @@ def profiled(answer: Answer, answered: Answered, monitor: Monitor) -> Answer:
     if monitor.stopped or not known or problem.model.rests or not choose(problem.model).cheap:
         return answer
     try:
-        sides, told = [answer], ""
+        sides, over = [answer], None
         for component in _components(problem):
             while not component.startswith("position"):
-                found = _sides(answer, Curve.of(answer.posterior, component), answered, monitor)
-                sides, told = (found, component) if len(found) > 1 else (sides, told)
+                curve = Curve.of(answer.posterior, component)
+                found = _sides(answer, curve, answered, monitor)
+                sides, over = (found, curve) if len(found) > 1 else (sides, over)
                 if found[0] is answer:
                     break
                 answer = sides[0] = _instead(answer, found[0])
@@ -59,23 +60,22 @@ def profiled(answer: Answer, answered: Answered, monitor: Monitor) -> Answer:
             monitor.enter(f"answers along {ridge.component}", answering=True)
             parts = _along(answer, ridge, sides[:MOST], answered)
             return _mixed(answer, parts, ridge, f"The data hardly tell {ridge.component}")
-        if len(sides) > 1:
+        if over is not None:
             apart = [_Part(0, one, one.objective) for one in sides]
-            curve = next(one for one in curves if one.component == told)
-            return _mixed(answer, apart, curve, f"The data do not tell on which side {told} lies")
+            why = f"The data do not tell on which side {over.component} lies"
+            return _mixed(answer, apart, over, why)
     except Stopped:
         said = f"{monitor.stopped} before other answers were looked at"
         return answer.noted(f"{said}: intervals may be too short.")
     return answer
 
 
-def _instead(answer: Answer, better: Answer) -> Answer:
+def _instead(first: Answer, better: Answer) -> Answer:
     """A better answer with what was found around the first one."""
-    gain = better.objective - answer.objective
-    moved = answer.posterior.summary.mean - better.posterior.summary.mean
-    mirrors = (m._replace(gain=m.gain - gain, shift=m.shift + moved) for m in answer.mirrors)
-    kept: Any = dict(motion=answer.motion, optima=answer.optima, best=answer.best)
-    return replace(better, mirrors=tuple(mirrors), **kept)
+    gain = better.objective - first.objective
+    moved = first.posterior.summary.mean - better.posterior.summary.mean
+    mirrors = tuple(m._replace(gain=m.gain - gain, shift=m.shift + moved) for m in first.mirrors)
+    return replace(better, motion=first.motion, optima=first.optima, best=first.best, mirrors=mirrors)
 
 
 def _mixed(answer: Answer, parts: Sequence["_Part"], curve: "Curve", why: str) -> Answer:
@@ -103,9 +103,12 @@ def _mixed(answer: Answer, parts: Sequence["_Part"], curve: "Curve", why: str) -
 def _part(answer: Answer, curve: "Curve", weight: float) -> Mirrored:
     """An answer as one of a mixture, named by where its tracks are along the component."""
     point, summary = answer.posterior.point, answer.posterior.summary
-    pairs = answer.problem.model.each_layout(point.states, curve.shift)
-    place = np.median(np.concatenate([np.asarray(x)[shift > 0] for _, x, shift in pairs]))
-    name, gain = f"{curve.component} {place:.4g}", float(np.log(weight))
+    problem, told = answer.problem, list[str]()
+    for _, epochs, x, shift in problem.model.each_layout(problem.epochs, point.states, curve.shift):
+        for mine in epochs.members.values():
+            own = np.asarray(x)[mine][shift[mine] > 0]
+            told += [f"{np.median(own):.4g}"] if own.size else []
+    name, gain = f"{curve.component} {listed(told, MOST)}", float(np.log(weight))
     return Mirrored(name, gain, point, summary.mean, status=str(answer.status))
 
 
@@ -200,6 +203,8 @@ def _sides(answer: Answer, curve: Curve, answered: Answered, monitor: Monitor) -
     """
     problem, here = answer.problem, answer.posterior.point
     ways, found = _undone(answer.posterior, curve), [answer]
+    if not ways:
+        return found
     climb = SideClimb.on(problem, engine_of("dense", problem.model))
     known, seen = dict[frozenset[int], tuple[Point, float]](), set[frozenset[int]]()
 
@@ -214,20 +219,19 @@ def _sides(answer: Answer, curve: Curve, answered: Answered, monitor: Monitor) -
         alike = any(not curve.apart(problem, point, other) for other, _ in known.values())
         known[side] = point, -np.inf if alike else climb.evidence(point, value)
 
-    if ways:
-        add(frozenset(), here)
-    changes = [*map(frozenset, {(k,) for k in range(len(ways))} | {tuple(range(len(ways)))})]
-    while ways and len(known) < 16 * MOST:
-        waiting = [one for one in near(NEAR) if one not in seen]
-        if not waiting:
+    add(frozenset(), here)
+    changes = [frozenset(range(len(ways))), *(frozenset({k}) for k in range(len(ways)))]
+    while len(known) < 16 * MOST:
+        side = next((one for one in near(NEAR) if one not in seen), None)
+        if side is None:
             break
-        seen.add(waiting[0])
-        for other in (waiting[0] ^ change for change in changes):
+        seen.add(side)
+        for other in (side ^ change for change in changes):
             if other and other not in known:
                 moved = zip(*(ways[t] for t in other), strict=True)
                 shift = (sum(own, start=np.zeros(1)) for own in moved)
-                add(other, _followed(problem, here._replace(z=known[waiting[0]][0].z), shift, 1.0))
-    for side in near(SAME)[: 2 * MOST] if ways else []:
+                add(other, _followed(problem, here._replace(z=known[side][0].z), shift, 1.0))
+    for side in near(SAME)[: 2 * MOST]:
         if side and (own := answered(problem, known[side][0])) is not None:
             found.append(own)
     return sorted(found, key=lambda one: -one.objective)
@@ -277,27 +281,24 @@ def _along(answer: Answer, curve: Curve, sides: list[Answer], answered: Answered
 
     def reached(k: int, start: Point) -> _Part | None:
         """The answer at a place, where the way goes on from it."""
-        if len(found) == 16 * MOST:  # of what nothing bounds
-            return None
         problem, density = line.held(k)
         own = answered(problem, _followed(problem, start, curve.shift, 0.0))
         if own is None:
             return None
-        places = [one.answer.posterior.point for one in found if one.k == k]
-        if not all(curve.apart(problem, own.posterior.point, place) for place in places):
+        point, here = own.posterior.point, (one.answer for one in found if one.k == k)
+        if not all(curve.apart(problem, point, one.posterior.point) for one in here):
             return None
-        worth = own.objective + density if line.follows(own.posterior.point) else -np.inf
+        worth = own.objective + density if line.follows(point) else -np.inf
         found.append(part := _Part(k, own, worth))
         return part if part.worth > max(one.worth for one in found) - SAME else None
 
     for side in sides:
-        start = side.posterior.point
-        middle = reached(line.number(start), start)
+        middle = reached(line.number(side.posterior.point), side.posterior.point)
         for sign in (1, -1):
             part = middle
-            while part is not None:
+            while part is not None and len(found) < 16 * MOST:  # nothing may bound a ridge
                 part = reached(part.k + sign, part.answer.posterior.point)
-    follows = np.isfinite([one.worth for one in found]).all()
+    follows = all(one.worth > -np.inf for one in found)
     return found if follows else []  # the track leaves such a start
 
 
@@ -313,9 +314,9 @@ class _Line(NamedTuple):
     def of(cls, answer: Answer, curve: Curve) -> "_Line":
         """Of the target that the second order changes most, by two sds of the biases a step."""
         problem, point = answer.problem, answer.posterior.point
-        sums = (own[2] for own in _sums(answer.posterior, curve))
+        sums = _sums(answer.posterior, curve)
         _, r, epoch, entry = max(
-            (own[epoch], r, epoch, entry)
+            (own[2, epoch], r, epoch, entry)
             for r, (part, own, shift) in enumerate(problem.model.each_layout(sums, curve.shift))
             for epoch, entry in np.argwhere(np.asarray(part.first)[:, None] & (shift > 0))
         )
@@ -341,6 +342,6 @@ class _Line(NamedTuple):
 def _first_and_median(problem: Problem, where: Spot, point: Point) -> np.ndarray:
     """An entry of the first state of a target, and its median along the track."""
     r, epoch, entry = where
-    mine = next(own for own in problem.epochs[r].members.values() if own[epoch])
+    mine = problem.epochs[r].target == problem.epochs[r].target[epoch]
     track = np.asarray(point.states[r])[mine, entry]
     return np.array([track[0], np.median(track)])
