@@ -47,7 +47,7 @@ def profiled(answer: Answer, answered: Answered, monitor: Monitor) -> Answer:
     try:
         sides, over = [answer], None
         for component in _components(problem):
-            while not component.startswith("position"):
+            while True:
                 curve = Curve.of(answer.posterior, component)
                 found = _sides(answer, curve, answered, monitor)
                 sides, over = (found, curve) if len(found) > 1 else (sides, over)
@@ -108,7 +108,7 @@ def _part(answer: Answer, curve: "Curve", weight: float) -> Mirrored:
         for mine in epochs.members.values():
             own = np.asarray(x)[mine][shift[mine] > 0]
             told += [f"{np.median(own):.4g}"] if own.size else []
-    name, gain = f"{curve.component} {listed(told, MOST)}", float(np.log(weight))
+    name, gain = f"{curve.component} {listed(told, MOST)}", float(np.log(max(weight, 1e-300)))
     return Mirrored(name, gain, point, summary.mean, status=str(answer.status))
 
 
@@ -162,11 +162,11 @@ class Curve(NamedTuple):
 
 
 def _components(problem: Problem) -> list[str]:
-    """Components of states that rows read, but for derivatives: "position_x", "height"."""
+    """Components of states that rows read, but for positions and derivatives: "height"."""
     found = dict[str, None]()
     for r, epochs in enumerate(problem.epochs):
         for entry in problem.model.entries(r):
-            if not epochs.components[entry].startswith(("velocity", "acceleration")):
+            if not epochs.components[entry].startswith(("position", "velocity", "acceleration")):
                 found[epochs.components[entry]] = None
     return list(found)
 
