@@ -20,7 +20,7 @@ from probcal.inference import solve
 
 
 def looked_at(problem, truth):
-    """Whether each interval of an offset and of a height holds the truth, offsets far off, and seconds."""
+    """The offsets and heights in their intervals, the offsets beyond 3 sd, and seconds of the fit."""
     begun = perf_counter()
     tree = fit(problem, MAP(), prior=Gaussian())
     seconds, own = perf_counter() - begun, tree["calibration"].to_dataset()
@@ -43,7 +43,7 @@ def main():
     print("| answer | offsets held, % | heights held, % | offsets beyond 3 sd, % | seconds, median | longest |")
     print("|:--|--:|--:|--:|--:|--:|")
     drawn = [heights(run, given.targets) for run in range(given.runs)]
-    looked_at(*drawn[0])  # kernels
+    looked_at(*drawn[0])  # compiles
     for name, change in (("one Gaussian", {"profiled": lambda answer, *_: answer}), ("as fitted", {})):
         with patch.multiple(solve, **change):
             found = [looked_at(*own) for own in drawn]

@@ -77,12 +77,16 @@ def _iterate(model: Model, prior: Prior, given: Given, state: State, rule: str, 
     steps = FEW if few else STEPS if prior.proper else UNHELD
     known = state.carry or None
     mode, solved = _climb(model, state.point, now, steps, 1e-2 * given.tolerance, trajectory, known)
-    return _settled(model, prior, given, state, mode, solved)._replace(carry=() if known is None else solved)
+    ended = (trajectory == "marginal") & (mode.iterations < steps)
+    state = _settled(model, prior, given, state, mode, solved, ended)
+    return state._replace(carry=() if known is None else solved)
 
 
 @partial(jax.jit, static_argnames="prior")
-def _settled(model: Model, prior: Prior, given: Given, state: State, mode: Mode, solved: Eliminated) -> State:
-    """The state at a mode, with what was found there."""
+def _settled(
+    model: Model, prior: Prior, given: Given, state: State, mode: Mode, solved: Eliminated, ended: Any
+) -> State:
+    """The state at a mode, with what was found there by a marginal search that `ended`, or by another."""
     now = given.prior._replace(alpha=state.alpha)
     state = state._replace(found=laplace_of(model, mode.point, solved, now))
     objective = (
@@ -94,8 +98,8 @@ def _settled(model: Model, prior: Prior, given: Given, state: State, mode: Mode,
     # on a cusp, where a target grazes a sensor, and where rounding hides what is left, no step lowers the cost
     nothing = still & (mode.gained < given.tolerance)
     learns = prior.learns or model.learns_noise
-    # on a kink of the density, where tracks leave a plane of all sensors to either side
-    kink = (mode.gained < GAIN / 5) & (jnp.abs(objective - state.objective) < GAIN / 5)
+    # on a kink of the marginal density, where tracks leave a plane of all sensors to either side, no step is left
+    kink = ended & (mode.gained < GAIN / 5) & (jnp.abs(objective - state.objective) < GAIN / 5)
     done = nothing | (mode.converged & still if learns else mode.converged | kink)
     done = done | jnp.any(astray(prior, mode.point.z, given.surveyed))  # it diverged: no further step helps
     refused = state.refused & mode.refused

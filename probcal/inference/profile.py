@@ -152,7 +152,7 @@ class Curve(NamedTuple):
         return cls(component, shift, tuple(first), tuple(second), length)
 
     def apart(self, problem: Problem, a: Point, b: Point) -> bool:
-        """Whether the track of a target lies more than a shift apart at two points."""
+        """Say whether the track of a target is more than a shift apart at two points."""
         pairs = problem.model.each_layout(problem.epochs, a.states, b.states, self.shift)
         return any(
             np.sum((np.asarray(x) - y)[mine] ** 2 * (shift[mine] > 0)) > np.sum(shift[mine] ** 2)
@@ -162,7 +162,7 @@ class Curve(NamedTuple):
 
 
 def _components(problem: Problem) -> list[str]:
-    """Components of states that rows read, but for positions and derivatives: "height"."""
+    """Components of states that rows read, as "height"; no positions, no derivatives."""
     found = dict[str, None]()
     for r, epochs in enumerate(problem.epochs):
         for entry in problem.model.entries(r):
@@ -268,9 +268,9 @@ def _sums(posterior: Posterior, curve: Curve) -> list[np.ndarray]:
 
 
 class _Part(NamedTuple):
-    """An answer with a first state held."""
+    """An answer of a mixture."""
 
-    k: int  # number of its place
+    k: int  # number of the place where a first state is held, 0 where none is
     answer: Answer
     worth: float  # logarithm of its weight
 
@@ -296,7 +296,7 @@ def _along(answer: Answer, curve: Curve, sides: list[Answer], answered: Answered
         middle = reached(line.number(side.posterior.point), side.posterior.point)
         for sign in (1, -1):
             part = middle
-            while part is not None and len(found) < 16 * MOST:  # nothing may bound a ridge
+            while part is not None and len(found) < 16 * MOST:  # some have no end
                 part = reached(part.k + sign, part.answer.posterior.point)
     follows = all(one.worth > -np.inf for one in found)
     return found if follows else []  # the track leaves such a start
