@@ -98,7 +98,7 @@ def _settled(
     # on a cusp, where a target grazes a sensor, and where rounding hides what is left, no step lowers the cost
     nothing = still & (mode.gained < given.tolerance)
     learns = prior.learns or model.learns_noise
-    # on a kink of the marginal density, where tracks leave a plane of all sensors to either side, no step is left
+    # nor on a kink of the marginal density, where tracks leave a plane of all sensors
     kink = ended & (mode.gained < GAIN / 5) & (jnp.abs(objective - state.objective) < GAIN / 5)
     done = nothing | (mode.converged & still if learns else mode.converged | kink)
     done = done | jnp.any(astray(prior, mode.point.z, given.surveyed))  # it diverged: no further step helps

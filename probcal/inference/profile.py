@@ -59,7 +59,8 @@ def profiled(answer: Answer, answered: Answered, monitor: Monitor) -> Answer:
         if ridge is not None and ridge.length > FAR:
             monitor.enter(f"answers along {ridge.component}", answering=True)
             parts = _along(answer, ridge, sides[:MOST], answered)
-            return _mixed(answer, parts, ridge, f"The data hardly tell {ridge.component}")
+            more = ", and no end of that was found" if len(parts) >= 16 * MOST else ""
+            return _mixed(answer, parts, ridge, f"The data hardly tell {ridge.component}{more}")
         if over is not None:
             apart = [_Part(0, one, one.objective) for one in sides]
             why = f"The data do not tell on which side {over.component} lies"
