@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         EM,
         EMEA,
         MAP,
+        MCMC,
         NUTS,
         SVI,
         Collapsed,
@@ -99,7 +100,7 @@ __all__ = lazy(
         "probcal.errors": "FitError InputError",
         "probcal.geodesy": "LocalFrame",
         "probcal.inference": (
-            "EA EM EMEA MAP NUTS SVI Collapsed Cubature Extended Gibbs LeastSquares "
+            "EA EM EMEA MAP MCMC NUTS SVI Collapsed Cubature Extended Gibbs LeastSquares "
             "Unscented fit log_evidence numpyro_model track"
         ),
         "probcal.motion": (

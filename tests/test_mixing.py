@@ -11,12 +11,13 @@ import probcal
 from probcal import Collapsed, Gaussian, Problem
 from probcal.gaussian.frame import frame_at, log_joint, log_weight, unit_normals, volume
 from probcal.inference import sampling
+from probcal.inference.chains import Draw
 from probcal.inference.collapsed import CollapsedState
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.leaps import Place, leap
-from probcal.inference.mixed import settled, weights_of_sides
+from probcal.inference.mixed import Effective, effective_draws, mixing, r_hat_limit, weights_of_sides
 from probcal.inference.posed import Form, Posed, conditional, log_prior
-from probcal.inference.sampling import Plan
+from probcal.inference.sampling import kept_of
 from probcal.inference.sides import distances, shifted
 from probcal.modes import automatic_start
 from probcal.modes.grid import track_mode
@@ -30,9 +31,19 @@ WEIGHT, NORMALS = jax.jit(log_weight), jax.jit(unit_normals)
 METHOD = Collapsed(chains=2, warmup=50, draws=100, sweeps=1, patience=4)
 
 
+def made_of(theta, side, **phi):
+    """Draws of values (chain, draw, P) on sides (chain, draw), with hyper-parameters."""
+    none = np.zeros(0)
+    return Draw(theta, phi, none, none, (), none, {"side": side})
+
+
 def test_chains_that_agree_have_settled_and_others_have_not():
     random = np.random.default_rng(0)
     draws, side = random.normal(size=(4, 500, 3)), np.zeros((4, 500), int)
+
+    def settled(draws, side, count, wanted=0, **phi):
+        return effective_draws(made_of(draws, side, **phi), count, wanted).settled
+
     assert settled(draws, side, 1)
     assert not settled(draws + np.arange(4)[:, None, None], side, 1), "one chain lies apart"
     assert not settled(np.repeat(draws[:, :100], 5, 1), side, 1), "few are effective"
@@ -40,28 +51,37 @@ def test_chains_that_agree_have_settled_and_others_have_not():
     assert not settled(draws, apart, 2), "no chain crosses"
     assert settled(draws + 100.0 * (one := random.integers(0, 2, side.shape))[..., None], one, 2), "sides may differ"
     np.testing.assert_allclose(weights_of_sides(apart, 2), [[0.5, 0.5], [0.5 / np.sqrt(3)] * 2])
+    assert settled(draws, side, 1, 1000)
+    assert not settled(draws, side, 1, 4000), "so many are not effective"
+    stuck = np.repeat(np.exp(draws[:, :50, 0]), 10, 1)
+    assert settled(draws, side, 1, scale=stuck)
+    assert not settled(draws, side, 1, 1000, scale=stuck), "hyper-parameters count where draws are to be effective"
 
 
-@pytest.mark.parametrize(("warmup", "draws"), [(100, 500), (30, 70), (0, 1), (120, 130)])
-def test_a_plan_keeps_the_draws_that_were_asked_for(warmup, draws):
-    """Chunks are numbered through; each plan cuts its own draws from all that were kept, whatever the chunks' size."""
-    plan = Plan(Collapsed(warmup=warmup, draws=draws, patience=16))
-    numbers, thin = {}, []
-    while True:
-        for chunk in range(plan.begin, plan.end):
-            whole = 1000 * chunk + np.arange(Collapsed.chunk)
-            numbers[chunk] = whole[len(whole) - plan.kept(chunk) :]
-        cut = np.concatenate([numbers[chunk] for chunk in range(plan.begin, plan.end)])[:draws]
-        assert len(cut) == draws
-        assert cut[0] // 1000 >= plan.begin
-        assert plan.done(plan.end) >= draws
-        thin.append(plan.thin)
-        if plan.last:
-            break
-        assert plan.longer().begin == plan.end
-        plan = plan.longer()
-    assert thin == [1, 4, 16]
-    assert plan.steps(plan.end) == 50 * (-(-(warmup + draws) // 50) + 20 * -(-draws // 50))
+@pytest.mark.parametrize(("warmup", "draws"), [(100, 500), (30, 70), (0, 1), (120, 131)])
+def test_a_chain_keeps_as_many_draws_as_asked_at_equal_steps(warmup, draws):
+    """Draws are numbered by their step: none is of the warm-up, and of more steps they are as far apart."""
+    method, made, chunks, kept = Collapsed(warmup=warmup, draws=draws, patience=16), [], 0, kept_of(Collapsed(), 0)
+    for thin in (1, 2, 4, 8):
+        full = False
+        while not full:
+            chunks, after = chunks + 1, kept_of(method, chunks + 1)
+            steps = kept.steps + after.thin * (1 + np.arange(method.chunk))
+            made += steps[method.chunk - (after.held - kept.held) :].tolist()
+            kept, full = after, after.full(method)
+        apart = np.diff(np.array(made)[kept.draws])
+        assert (kept.thin, kept.held, len(kept.draws), made[0]) == (thin, len(made), draws, warmup + 1)
+        assert np.all(apart >= thin)
+        assert np.sum(apart > thin) <= np.log2(thin), "what a chunk has beyond the last draw is left out"
+
+
+@pytest.mark.parametrize("chains", [2, 4])
+def test_r_hat_of_independent_draws_is_beyond_its_limit_in_one_run_of_a_hundred(chains):
+    random, runs = np.random.default_rng(3), 300
+    worst = [mixing(random.normal(size=(chains, 100, 5))) for _ in range(runs)]
+    beyond = sum(np.any(found["r_hat"] > r_hat_limit(found["ess"], chains)) for found in worst)
+    assert beyond <= 9, "binomial: 10 of 300 happen in one of 1,000 tests"
+    assert np.all(r_hat_limit(np.array([1e6]), chains) == 1.01)
 
 
 def drawn(method=METHOD, **options):
@@ -71,25 +91,25 @@ def drawn(method=METHOD, **options):
 
 
 @pytest.mark.slow
-def test_what_has_not_mixed_is_drawn_anew_and_resumed(tmp_path, monkeypatch):
+def test_what_has_not_mixed_goes_on_with_more_steps_and_is_resumed(tmp_path, monkeypatch):
     assert drawn().attrs["thin"] == 1
-    monkeypatch.setattr(sampling, "settled", lambda *_: False)
+    monkeypatch.setattr(sampling, "effective_draws", lambda *_: Effective(1.0, False))
     seen = []
     longer = drawn(progress=seen.append, store=tmp_path)
     assert longer.attrs["thin"] == 4
     assert longer["posterior"].sizes["draw"] == 100
     steps = [(at.done, at.total) for at in seen if at.done]
-    assert steps == [(50, 150), (100, 150), (150, 150), (350, 550), (550, 550)]
+    assert steps == [(50, 150), (100, 150), (150, 150), (250, 250), (450, 450)]
     again = drawn(store=tmp_path, resume=True)
     assert np.array_equal(again["posterior"]["bias"], longer["posterior"]["bias"])
 
     def stop(at):
-        if at.done >= 350:
+        if at.done >= 250:
             raise KeyboardInterrupt
 
     short = drawn(progress=stop, store=tmp_path, overwrite=True)
-    assert (short.attrs["thin"], short["posterior"].sizes["draw"]) == (4, 50), "50 draws of 4 steps are more than 100"
-    assert np.array_equal(short["posterior"]["bias"], longer["posterior"]["bias"][:, :50])
+    assert (short.attrs["thin"], short["posterior"].sizes["draw"]) == (2, 100)
+    assert np.array_equal(short["posterior"]["bias"][:, 1::2], longer["posterior"]["bias"][:, :50])
 
 
 def two_sides():

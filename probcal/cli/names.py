@@ -41,6 +41,7 @@ METHODS = {
     "map-l1": KnownMethod("MAP", False, _FIXED),
     "ml": KnownMethod("MAP", False, _FIXED),
     "nls": KnownMethod("least squares", False, ("flat",)),
+    "mcmc": KnownMethod("MCMC", True, (*_SAMPLED, "bernoulli-gaussian")),
     "collapsed": KnownMethod("Collapsed", True, (*_SAMPLED, "bernoulli-gaussian")),
     "collapsed-spike": KnownMethod("Collapsed", True, (*_SAMPLED, "bernoulli-gaussian")),
     "nuts": KnownMethod("NUTS", True, _SAMPLED),

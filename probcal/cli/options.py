@@ -114,7 +114,7 @@ def chain_sizes(method: str, sizes: Mapping[str, int | None]) -> dict[str, int]:
     """The numbers of chains and draws that are given; raises `InputError` for a method that draws none."""
     given = {option: number for option, number in sizes.items() if number is not None}
     if given and not METHODS[method].chains:
-        raise InputError(f'--{next(iter(given))}: "{method}" draws no chains; take collapsed, nuts, gibbs or svi')
+        raise InputError(f'--{next(iter(given))}: "{method}" draws no chains; take mcmc, collapsed, nuts, gibbs or svi')
     return given
 
 

@@ -98,7 +98,7 @@ class Collapsed(FramedSampler):
     Conjugate Gibbs for scale mixtures and for the Bernoulli-Gaussian, `sweeps` of it (None: as pays for the prior)
     a leap of each of `chains`, four leaps a draw. Biases and trajectories also move together, by a Hamiltonian swing.
     Where the frame fits badly it is moved; where that fails the joint sampler `NUTS` takes over if it has the prior.
-    Draws that have not mixed are made anew with 4 times as many steps from one to the next, up to `patience`.
+    Where draws have not mixed every second one is kept of twice as many steps, up to one of `patience` steps.
     Raises `InputError` for less than one sweep or step.
     """
 
@@ -107,6 +107,7 @@ class Collapsed(FramedSampler):
     draws: int = 500
     sweeps: int | None = None
     patience: int = 16
+    effective: int = 0
 
     name = "Collapsed"
     priors = (Horseshoe, Prior)
@@ -123,11 +124,12 @@ class Collapsed(FramedSampler):
 
     def kernel(self) -> "Collapsed":
         """The method whatever the number of its chains and draws."""
-        return replace(self, chains=1, warmup=0, draws=1, patience=1)
+        return replace(self, chains=1, warmup=0, draws=1, patience=1, effective=0)
 
     def instead(self, prior: Prior, fallback: Any) -> Sampler | None:
         """The fallback where it has the prior."""
-        return replace(fallback, chains=self.chains, draws=self.draws) if fallback.takes(prior) else None
+        own = {"patience": self.patience, "effective": self.effective} if self.effective else {}
+        return replace(fallback, chains=self.chains, draws=self.draws, **own) if fallback.takes(prior) else None
 
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> CollapsedState:
         """A chain at a draw of the frame's posterior."""

@@ -53,12 +53,11 @@ class SweepState(NamedTuple):
     at: Any  # (C, n + H) states, biases and log levels
     phi: Any  # (C, ...) of each hyper-parameter
     made: Any  # () sweeps of a chain
-    thin: Any  # () of them from one draw to the next
-    summed: Any  # (2,) sweeps of all chains in the sums: of this thin after the warm-up, and of the one before
-    total: Any  # (2, S) sum of the states
-    square: Any  # (2, S) of their squares, both about the reference
-    gamma: Any  # (2, M) sum of gamma
-    variance: Any  # (2, M) sum of the variances of the biases given their hyper-parameters
+    summed: Any  # () sweeps of all chains after the warm-up, which the sums are of
+    total: Any  # (S,) sum of the states
+    square: Any  # (S,) of their squares, both about the reference
+    gamma: Any  # (M,) sum of gamma
+    variance: Any  # (M,) sum of the variances of the biases given their hyper-parameters
     reference: Any  # (n,) where the Gaussian is taken
     kicks: Any  # () of a turn
 
@@ -146,8 +145,8 @@ class GibbsChains(Chains):
     def _begun(self, at: np.ndarray, phi: Any, reference: np.ndarray, kicks: int) -> SweepState:
         M, S = self.form.biases, self.model.state_size
         levels = np.broadcast_to(self.mode.point.levels, (len(at), len(self.mode.point.levels)))
-        whole, counts = np.concatenate([at, levels], 1), (np.array(0), np.array(1), np.zeros(2, int))
-        sums = np.zeros((2, S)), np.zeros((2, S)), np.zeros((2, M)), np.zeros((2, M))
+        whole, counts = np.concatenate([at, levels], 1), (np.array(0), np.array(0))
+        sums = np.zeros(S), np.zeros(S), np.zeros(M), np.zeros(M)
         return SweepState(whole, phi, *counts, *sums, reference, np.array(kicks))
 
     def _kicks(self, chain: _Chain, key: jax.Array) -> int:
@@ -165,8 +164,6 @@ class GibbsChains(Chains):
     def advance(self, state: SweepState, thin: int) -> tuple[SweepState, Draw]:
         """All chains one chunk further, every `thin`-th sweep kept."""
         reference, sums = self._at(np.asarray(state.reference)), {name: np.array(getattr(state, name)) for name in SUMS}
-        if int(state.thin) != thin:  # begun anew: what was before is warm-up
-            sums = {name: np.stack([np.zeros_like(own[0]), own[0]]) for name, own in sums.items()}
         ends, drawn = list[_Chain](), []
         for c in range(self.method.chains):
             at, levels = np.split(np.asarray(state.at[c]), [len(reference.variables)])
@@ -176,15 +173,15 @@ class GibbsChains(Chains):
             for _ in range(self.method.chunk):
                 for _ in range(thin):
                     own, moments = self._swept(own, int(state.kicks))
-                    if thin > 1 or own.made > self.method.warmup:
+                    if own.made > self.method.warmup:
                         for name, value in moments.items():
-                            sums[name][0] += value
+                            sums[name] += value
                 parts.append(self._draw(own))
             ends.append(own)
             drawn.append(jax.tree.map(lambda *leaves: np.stack(leaves), *parts))
         after = state._replace(
             at=np.stack([np.append(own.at, own.levels) for own in ends]),
-            made=np.array(ends[0].made), thin=np.array(thin),
+            made=np.array(ends[0].made),
             phi={name: np.stack([np.asarray(own.phi[name]) for own in ends]) for name in state.phi},
             **sums,
         )  # fmt: skip
@@ -274,8 +271,8 @@ class Gibbs(Sampler):
     accepted. Any prior with a density.
     Of more than four million numbers no draws of states are kept, their means and sds are. Chains
     run one after the other; biases and tracks start at draws under the declared scales, on the side
-    of a mirror that fits best. They do not visit the others, which the answer names. Draws that
-    have not mixed are made anew with 4 times as many sweeps from one to the next, up to `patience`.
+    of a mirror that fits best. They do not visit the others, which the answer names. Where
+    draws have not mixed every second one is kept of twice as many sweeps, up to one of `patience`.
     Raises `InputError` for less than one chain or draw.
     """
 
@@ -283,6 +280,7 @@ class Gibbs(Sampler):
     warmup: int = 50
     draws: int = 250
     patience: int = 4
+    effective: int = 0
 
     name = "Gibbs"
     priors = (Horseshoe, Prior)
@@ -319,8 +317,7 @@ def gibbs_chains(
 ) -> Posterior:
     """The posterior of a run of `Gibbs`: the draws of the biases, and moments of the states."""
     z, model, M = run.z, problem.model, run.form.biases
-    which = 0 if int(state.thin) == run.thin else 1  # a longer run that was interrupted leaves the draws before it
-    count, total, square, told, spread = (np.asarray(getattr(state, name))[which] for name in SUMS)
+    count, total, square, told, spread = (np.asarray(getattr(state, name)) for name in SUMS)
     blocks = SensorBlocks.drawn(z.reshape(-1, M), blocks_of(model), spread / count)
     near = runs.mode.moved(z.mean((0, 1)) - np.asarray(runs.mode.point.z))
     at = runs.engine.settled(runs.model, at_levels(runs.model, near, jnp.asarray(run.levels.mean((0, 1)))))

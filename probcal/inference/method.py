@@ -152,6 +152,10 @@ class Method(ABC):
         """What the message of a fit says of the method under a prior; empty where nothing is to be said."""
         return ""
 
+    def suited(self, problem: Problem) -> Method:
+        """The method that runs on a problem; itself, unless it chooses."""
+        return self
+
     def prepare(self, problem: Problem) -> Problem:
         """The problem that is solved in the place of the given one."""
         return problem

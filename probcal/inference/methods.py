@@ -14,6 +14,7 @@ from probcal.inference.collapsed import Collapsed
 from probcal.inference.ea import EA, MAP, LeastSquares
 from probcal.inference.em import EM, EMEA
 from probcal.inference.joint_gibbs import Gibbs
+from probcal.inference.mcmc import MCMC
 from probcal.inference.method import Method
 from probcal.inference.nuts import NUTS
 from probcal.inference.run import Maximiser
@@ -38,6 +39,7 @@ METHODS = WithWings[tuple[Method, Prior | None]](
         "map-l1": (MAP(), Laplace()),
         "ml": (MAP(), Flat()),
         "nls": (LeastSquares(), None),
+        "mcmc": (MCMC(), None),
         "collapsed": (Collapsed(), None),
         "collapsed-spike": (Collapsed(), BernoulliGaussian()),
         "nuts": (NUTS(), None),

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from probcal.inference.chains import Draw
 from probcal.lazy import Later
 
 if TYPE_CHECKING:
     from arviz_stats.base import array_stats
+    from scipy import stats
 else:
-    array_stats = Later("arviz_stats.base.array_stats")
+    array_stats, stats = Later("arviz_stats.base.array_stats"), Later("scipy.stats")
 
 R_HAT = 1.01  # above which chains have not mixed
 ESS = 100  # effective draws a chain below which its quantiles are not to be trusted
 UNSURE = 0.1  # standard error of the weight of a side above which it is not known
 
 FEW = 0.25  # share of few draws that must be effective
-NOISE = 4.0  # over the draws of a chain: by how much r_hat is above 1 without a reason
 
 
 def mixing(draws: np.ndarray) -> dict[str, np.ndarray]:
@@ -62,9 +64,51 @@ def weights_of_sides(side: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarr
     return np.mean(shares, 0), np.std(shares, 0) / np.sqrt(max(len(shares) - 1, 1))
 
 
-def settled(draws: np.ndarray, side: np.ndarray, count: int) -> bool:
-    """Whether draws (chain, draw, P) on these sides (chain, draw) have mixed as well as so many can show."""
-    found, (chains, number) = mixing(within_sides(draws, side)), draws.shape[:2]
-    enough = found["ess"].min() >= min(ESS, FEW * number) * chains
-    alike = "r_hat" not in found or found["r_hat"].max() <= max(R_HAT, 1 + NOISE / number)
-    return bool(enough and alike and weights_of_sides(side, count)[1].max() <= UNSURE)
+class Effective(NamedTuple):
+    """Effective draws of the quantity that has fewest, and whether they and r_hat are as asked."""
+
+    least: float
+    settled: bool
+
+
+def effective_draws(draws: Draw, count: int, wanted: int = 0) -> Effective:
+    """Whether draws on so many sides of a mirror have mixed as well as so many can show.
+
+    Of biases and levels; where so many effective draws are `wanted`, of hyper-parameters too.
+    """
+    theta, side = np.asarray(draws.theta), side_of_draws(draws)
+    names = [f"{k}" for k in range(theta.shape[2])]
+    found = mixing(within_sides(quantities(draws, names, hyper=wanted > 0)[1], side))
+    chains, number = theta.shape[:2]
+    enough = found["ess"].min() >= (wanted or min(ESS, FEW * number) * chains)
+    alike = "r_hat" not in found or np.all(found["r_hat"] <= r_hat_limit(found["ess"], chains))
+    weighed = weights_of_sides(side, count)[1].max() <= UNSURE
+    return Effective(float(found["ess"].min()), bool(enough and alike and weighed))
+
+
+def quantities(draws: Draw, names: Sequence[str], *, hyper: bool) -> tuple[list[str], np.ndarray]:
+    """Names, and values (chain, draw, P), of biases and levels, and of hyper-parameters by their logarithm."""
+    theta = np.asarray(draws.theta)
+    labels, values = list(names), [theta]
+    for name, own in draws.phi.items() if hyper else ():
+        flat = np.asarray(own).reshape(*theta.shape[:2], -1)
+        if flat.dtype != bool:
+            labels += [name] if flat.shape[2] == 1 else [f"{name} {k}" for k in range(flat.shape[2])]
+            values.append(np.log(flat) if np.all(flat > 0) else flat)
+    return labels, np.concatenate(values, 2)
+
+
+def side_of_draws(draws: Draw) -> np.ndarray:
+    """Which side of a mirror each draw (chain, draw) is on, 0 where there is none."""
+    return np.asarray(draws.stats.get("side", np.zeros(np.shape(draws.theta)[:2], int)))
+
+
+def r_hat_limit(ess: np.ndarray, chains: int) -> np.ndarray:
+    """The r_hat (P,) above which chains have not mixed: 1.01, or where it is larger what chance alone exceeds in 1 % of
+    the runs of so many quantities, of so many effective draws (P,).
+
+    Halves of `chains` have means whose variance over their expectation is chi-square over its degrees of freedom.
+    """
+    free = 2 * chains - 1
+    chance = stats.chi2.ppf(0.99 ** (1.0 / len(ess)), free) / free
+    return np.maximum(R_HAT, np.sqrt(1.0 + (chance - 1.0) * 2 * chains / np.maximum(ess, 1.0)))

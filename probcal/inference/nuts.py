@@ -40,6 +40,8 @@ class NUTS(FramedSampler):
     target: float = 0.85
     depth: int = 10
     dense: bool = False
+    patience: int = 1
+    effective: int = 0
 
     name = "NUTS"
     priors = (Horseshoe, Prior)
@@ -66,7 +68,7 @@ class NUTS(FramedSampler):
 
     def kernel(self) -> NUTS:
         """The method whatever the number of its chains and draws; its adaptation knows the length of the warm-up."""
-        return replace(self, chains=1, draws=1)
+        return replace(self, chains=1, draws=1, patience=1, effective=0)
 
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Any:
         """A chain at theta and phi, its trajectories drawn from the frame."""

@@ -16,7 +16,16 @@ from probcal.gaussian.mode import Point
 from probcal.inference.chains import Draw
 from probcal.inference.ending import FAR, bias_status, misfit_sentence
 from probcal.inference.hierarchy import drawn_precisions, inclusions
-from probcal.inference.mixed import ESS, R_HAT, UNSURE, mixing, weights_of_sides, within_sides
+from probcal.inference.mixed import (
+    ESS,
+    UNSURE,
+    mixing,
+    quantities,
+    r_hat_limit,
+    side_of_draws,
+    weights_of_sides,
+    within_sides,
+)
 from probcal.inference.pose import Worth, pareto_khat
 from probcal.inference.posed import Form, Natural, Posed
 from probcal.inference.sampler import Sampler
@@ -71,11 +80,6 @@ class SamplerRun:
     def states(self) -> list[np.ndarray]:
         """States (chain, draw, E, n) of each recursion."""
         return [np.asarray(x) for x in self.draws.states]
-
-
-def side_of_draws(draws: Draw) -> np.ndarray:
-    """Which side of a mirror each draw (chain, draw) is on, 0 where there is none."""
-    return np.asarray(draws.stats.get("side", np.zeros(np.shape(draws.theta)[:2], int)))
 
 
 def chains(
@@ -139,10 +143,12 @@ def conclude_draws(
     misfit: Callable[[Problem, Point], str] = misfit_sentence, **facts: Any,
 ) -> Answer:  # fmt: skip
     """The answer of a sampler's run; `misfit` says why its mean explains nothing, `facts` are further ones."""
-    mixed = mixing(within_sides(np.asarray(run.draws.theta), run.side))
+    labels = [*problem.labels, *(level.label for level in problem.levels)]
+    names, values = quantities(run.draws, labels, hyper=run.method.effective > 0)
+    mixed = mixing(within_sides(values, run.side))
     posterior = posterior_of(problem, prior, run, mixed)
     unexplained = misfit(problem, posterior.point)
-    known = facts_of(problem, run, mixed) | ({} if unexplained else facts_of_steps(problem, prior, run))
+    known = facts_of(names, run, mixed) | ({} if unexplained else facts_of_steps(problem, prior, run))
     status, message = judge(CHAINS, known | facts | {"misfit": unexplained})
     ended = bias_status(problem, {"not mixed": mixed["r_hat"][: run.form.biases] > 1.05} if "r_hat" in mixed else {})
     # the other sides that draws are on, seen from the heaviest: log ratio of weights, and shift
@@ -223,14 +229,13 @@ def _stats(run: SamplerRun) -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in run.draws.stats.items()}
 
 
-def facts_of(problem: Problem, run: SamplerRun, mixed: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """The facts that a run says of its draws, in the names of `probcal.status.CHAINS`."""
-    draws, names = run.z.shape[1], [*problem.labels, *(level.label for level in problem.levels)]
-    facts = {"note": run.note} | mixed_of(names, mixed, run.z.shape[0])
+def facts_of(names: Sequence[str], run: SamplerRun, mixed: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """The facts that a run says of its draws of named quantities, in the names of `probcal.status.CHAINS`."""
+    count, draws, wanted = *run.z.shape[:2], run.method.effective
+    facts = {"note": run.note} | mixed_of(names, mixed, count, r_hat_limit(mixed["ess"], count), wanted)
     if run.stopped:
-        how = f"after {draws} of {run.method.draws} draws a chain"
-        again = "while more steps were made, as the draws had not mixed"
-        facts["stopped"] = f"{run.stopped} {again if draws == run.method.draws else how}"
+        made = f"{draws} draws a chain" if wanted else f"{draws} of {run.method.draws} draws a chain"
+        facts["stopped"] = f"{run.stopped} after {made}" + (f", {run.thin} steps each" if run.thin > 1 else "")
     share, error = weights_of_sides(run.side, len(run.sides) + 1)
     if np.count_nonzero(share) > 1:
         listed = ", ".join(f"{share[k]:.2f} ± {error[k]:.2f}" for k in np.flatnonzero(share))
@@ -239,14 +244,17 @@ def facts_of(problem: Problem, run: SamplerRun, mixed: Mapping[str, np.ndarray])
     return facts
 
 
-def mixed_of(names: Sequence[str], mixed: Mapping[str, np.ndarray], chains: int, limit: Any = R_HAT) -> dict[str, Any]:
-    """Quantities whose chains have not mixed, or have few effective draws, worst first; `limit` is of each r_hat."""
+def mixed_of(
+    names: Sequence[str], mixed: Mapping[str, np.ndarray], chains: int, limit: Any, wanted: int = 0
+) -> dict[str, Any]:
+    """Quantities whose chains have not mixed, or have fewer effective draws than `wanted`, worst first; `limit` is of
+    each r_hat."""
     facts, few = dict[str, Any](), int(mixed["ess"].argmin())
     if "r_hat" in mixed:
         above = mixed["r_hat"] - limit
         worst = int(above.argmax())
         facts["r_hat"] = above[worst] > 0 and (names[worst], mixed["r_hat"][worst])
-    facts["few"] = mixed["ess"][few] < ESS * chains and (names[few], mixed["ess"][few])
+    facts["few"] = mixed["ess"][few] < (wanted or ESS * chains) and (names[few], mixed["ess"][few])
     return facts
 
 

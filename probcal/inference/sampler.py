@@ -34,6 +34,7 @@ class Sampler(Method, ABC):
     warmup: int
     draws: int
     chunk: ClassVar[int]  # draws between two checkpoints
+    effective: int = 0  # draws of every quantity at which the chains end before `draws`; 0: at `draws` of each chain
     patience: int = 1  # most steps from one draw to the next, where those after fewer have not mixed
     exact: ClassVar[bool] = True  # whether its draws are those of the posterior
     atoms: ClassVar[bool] = False  # whether it takes priors under which a bias may be exactly zero

@@ -8,7 +8,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import numpy as np
@@ -17,16 +17,16 @@ from probcal.errors import FitError
 from probcal.inference.chains import Draw
 from probcal.inference.loop import Pause
 from probcal.inference.method import MethodTask
-from probcal.inference.mixed import settled
+from probcal.inference.mixed import effective_draws
 from probcal.inference.pose import Worth
 from probcal.inference.posed import Form, Natural, Posed
-from probcal.inference.posterior import SamplerRun, conclude_draws, side_of_draws
+from probcal.inference.posterior import SamplerRun, conclude_draws
 from probcal.inference.progress import Monitor
 from probcal.inference.sampler import DRAWS, Sampler
 from probcal.modes.explore import Mirrored
 from probcal.results.answer import Answer
 
-GROWTH = 4  # by how many times more steps a draw is tried again that has not mixed
+FIRST = 50  # draws of a chain at which it is first looked whether enough of them are effective
 WARM_UP = "warm-up"  # the phase that leaves no draws
 MEAN = "mean_density"  # of all draws of a chunk, those that are not kept included
 
@@ -49,62 +49,33 @@ class DrawnChunks(tuple[Mapping[str, np.ndarray], ...]):
         return DrawnChunks((*self, *other))
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Which chunks are drawn: first every step is a draw; where these have not mixed, all anew, more steps a draw."""
+class Kept(NamedTuple):
+    """What is kept of the chunks of a chain: every draw, and where as many as asked have not mixed every second one of
+    twice as many steps, and so on."""
 
-    method: Sampler
-    thin: int = 1
-    before: Plan | None = None
+    draws: np.ndarray  # (D,) numbers of the draws, of all that the chunks hold
+    thin: int  # steps from one to the next
+    steps: int  # of the chain, warm-up included
+    held: int  # draws that the chunks hold
 
-    @property
-    def begin(self) -> int:
-        """The first chunk."""
-        return 0 if self.before is None else self.before.end
+    def full(self, method: Sampler) -> bool:
+        """Whether these are all that a method keeps."""
+        return len(self.draws) >= method.draws
 
-    @property
-    def end(self) -> int:
-        """The chunk after the last."""
-        return self.begin - (-(self._unkept + self.method.draws) // self.method.chunk)
+    def after(self, method: Sampler) -> Kept:
+        """The same after one more chunk."""
+        own, thin = (self.draws[::-2][::-1], 2 * self.thin) if self.full(method) else (self.draws, self.thin)
+        steps = self.steps + method.chunk * thin
+        new = self.held + np.arange(np.clip(steps - method.warmup, 0, method.chunk))
+        return Kept(np.append(own, new)[: method.draws], thin, steps, self.held + len(new))
 
-    @property
-    def _unkept(self) -> int:
-        return self.method.warmup if self.before is None else 0
 
-    @property
-    def last(self) -> bool:
-        """Whether the method has no patience for a longer one."""
-        return self.thin * GROWTH > self.method.patience
-
-    def longer(self) -> Plan:
-        """The next, of more steps between two draws; those before it are its warm-up."""
-        return Plan(self.method, self.thin * GROWTH, self)
-
-    def kept(self, chunk: int) -> int:
-        """How many draws of a chunk are kept, the last ones."""
-        size = self.method.chunk
-        return max(0, min((chunk - self.begin + 1) * size - self._unkept, size))
-
-    def done(self, count: int) -> int:
-        """Draws that are there after so many chunks."""
-        return max(0, (count - self.begin) * self.method.chunk - self._unkept)
-
-    def phase(self, count: int) -> str:
-        """The phase after so many chunks."""
-        if self.done(count) == 0 and self.before is None and self._unkept:
-            return WARM_UP
-        return "draws" if self.thin == 1 else f"draws, {self.thin} steps each"
-
-    def steps(self, count: int) -> int:
-        """Steps of a chain after so many chunks."""
-        own = (count - self.begin) * self.method.chunk * self.thin
-        return own + (0 if self.before is None else self.before.steps(self.begin))
-
-    def drawn(self, course: DrawnChunks) -> Draw:
-        """Its own draws of a course."""
-        own = course[self.begin : self.end]
-        names = [name for name in own[-1] if name != MEAN]
-        return gathered({name: np.concatenate([one[name] for one in own], 1)[:, : self.method.draws] for name in names})
+def kept_of(method: Sampler, chunks: int) -> Kept:
+    """What is kept of so many chunks."""
+    found = Kept(np.arange(0), 1, 0, 0)
+    for _ in range(chunks):
+        found = found.after(method)
+    return found
 
 
 @dataclass(eq=False)
@@ -122,6 +93,7 @@ class Chains(MethodTask):
     note: str = ""  # what happened on the way, a sentence or nothing
     phase: str = ""
     complete: bool = False  # whether all draws are made
+    share: float | None = None  # of the effective draws that are asked for, at the last look
     form: Form = field(init=False)
     posed: Posed | Natural = field(init=False)
 
@@ -132,34 +104,33 @@ class Chains(MethodTask):
     def advance(self, state: Any, thin: int) -> tuple[Any, Draw]:
         """All chains one chunk further, every `thin`-th step kept."""
 
-    def plan(self, number: int) -> Plan:
-        """The plan of a chunk."""
-        plan = Plan(self.method)
-        while number >= plan.end:
-            plan = plan.longer()
-        return plan
-
     def step(self, state: Any, count: int, pause: Pause) -> tuple[Any, DrawnChunks]:
         """One more chunk."""
-        plan = self.plan(count)
-        self._enter(plan.phase(count))
-        state, draws = self.advance(state, plan.thin)
+        self._enter(kept := kept_of(self.method, count))
+        after = kept.after(self.method)
+        state, draws = self.advance(state, after.thin)
         # draws as arrays (chains, draws, ...) by flat names, as a storage keeps them
         found = {name: getattr(draws, name) for name in ("theta", "gamma", "variance", "density")}
         found |= {f"phi_{name}": value for name, value in draws.phi.items()}
         found |= {f"stats_{name}": value for name, value in draws.stats.items()}
         found |= {f"states_{r}": value for r, value in enumerate(draws.states)}
-        kept, arrays = plan.kept(count), {name: np.asarray(value) for name, value in found.items()}
-        last: dict[str, Any] = {name: a[:, a.shape[1] - kept :].copy() for name, a in arrays.items()}
+        new, arrays = after.held - kept.held, {name: np.asarray(value) for name, value in found.items()}
+        last: dict[str, Any] = {name: a[:, a.shape[1] - new :].copy() for name, a in arrays.items()}
         return state, DrawnChunks([last | {MEAN: np.mean(arrays["density"])}])
 
     def ended(self, state: Any, course: DrawnChunks) -> bool:
-        """True where the draws of a plan are made and have mixed, or it is the last."""
-        count = len(course)
-        plan = self.plan(max(count - 1, 0))
-        if count == plan.end:
-            drawn = plan.drawn(course)
-            self.complete = plan.last or settled(np.asarray(drawn.theta), side_of_draws(drawn), 1 + len(self.sides))
+        """True where there are enough effective draws, or the method has no patience for more steps."""
+        method, kept = self.method, kept_of(self.method, len(course))
+        last = kept_of(method, len(course) - 1)
+        look = kept.full(method) or (
+            method.effective and len(kept.draws) >= FIRST and _octave(kept.steps) > _octave(last.steps)
+        )
+        if len(course) and look:
+            drawn = self._drawn(course, kept)
+            found = effective_draws(drawn, len(self.sides) + 1, method.effective)
+            self.share = found.least / method.effective if method.effective else None
+            spent = kept.full(method) and 2 * kept.thin > method.patience
+            self.complete = found.settled or spent
         return self.complete
 
     def course(self, stored: Sequence[Any] = ()) -> DrawnChunks:
@@ -167,12 +138,19 @@ class Chains(MethodTask):
         return DrawnChunks(stored)
 
     def tell(self, monitor: Monitor, done: int, objective: float) -> None:
-        """Report steps of all that the plan takes, by its phase."""
-        plan = self.plan(done - 1)
-        self._enter(plan.phase(done))
-        monitor.tell(self.name, plan.steps(done), plan.steps(plan.end), objective)
+        """Report the steps made, of those until all draws are made or, as it looks so far, enough are effective."""
+        kept, method = kept_of(self.method, done), self.method
+        self._enter(kept)
+        drawn = method.draws * kept.thin
+        if method.effective:  # known from the first look on
+            drawn = int((kept.steps - method.warmup) / self.share) if self.share else 0
+        total = method.warmup + drawn
+        monitor.tell(self.name, kept.steps, max(total, kept.steps), objective)
 
-    def _enter(self, phase: str) -> None:
+    def _enter(self, kept: Kept) -> None:
+        thin = kept.after(self.method).thin
+        phase = "draws" if thin == 1 else f"draws, {thin} steps each"
+        phase = WARM_UP if not len(kept.draws) and self.method.warmup else phase
         if phase != self.phase:
             self.phase = phase
             self.context.monitor.enter(phase, self.name, answering=phase != WARM_UP)
@@ -182,25 +160,30 @@ class Chains(MethodTask):
         return conclude_draws(self.problem, self.prior, self.run(course))
 
     def run(self, course: DrawnChunks) -> SamplerRun:
-        """The draws of a course: of chains that were stopped those of the plan before, if they are more.
-
-        Raises `FitError` where there are none yet, and where some are not finite.
-        """
-        count, stopped = len(course), "" if self.complete else self.context.monitor.stopped
-        plan = self.plan(count - 1 if self.complete else count)
-        if plan.before is not None and plan.done(count) * GROWTH < plan.method.draws and not self.complete:
-            plan = plan.before
-        if not plan.done(count):
+        """The draws of a course; raises `FitError` where there are none yet, and where some are not finite."""
+        kept, stopped = kept_of(self.method, len(course)), "" if self.complete else self.context.monitor.stopped
+        if not len(kept.draws):
             raise FitError(f"{stopped} in the warm-up, before there was a draw: give a longer limit, or fewer steps")
-        drawn, seconds = plan.drawn(course), time.perf_counter() - self.began
+        drawn, seconds = self._drawn(course, kept), time.perf_counter() - self.began
         if not np.isfinite(np.asarray(drawn.theta)).all():
             raise FitError(
                 f"{self.name}: some draw is not finite; give biases that no row determines a survey, or fix them"
             )
         return SamplerRun(
             self.method, self.asked, self.form, self.posed, self.worth, drawn, seconds, stopped, self.note, self.sides,
-            plan.thin,
+            kept.thin,
         )  # fmt: skip
+
+    @staticmethod
+    def _drawn(course: DrawnChunks, kept: Kept) -> Draw:
+        """The draws that are kept of a course."""
+        names = [name for name in course[-1] if name != MEAN]
+        return gathered({name: np.concatenate([one[name] for one in course], 1)[:, kept.draws] for name in names})
+
+
+def _octave(steps: int) -> int:
+    """A number that grows by 1 where steps grow by a quarter."""
+    return int(np.log(max(steps, 1)) / np.log(1.25))
 
 
 def each_chain(one: Callable[[Any], tuple[Any, Draw]], states: Any, chains: int, threads: int | None) -> Any:

@@ -50,6 +50,8 @@ def solve(
     """
     if starts < 1:
         raise InputError(f"starts={starts}: at least one start is needed")
+    if (suited := method.suited(problem)) is not method:
+        return replace(solve(problem, suited, prior, context, start=start, starts=starts), requested=method)
     if not problem.clocks.any():
         return solve_timed(problem, method, prior, context, start, starts)
     monitor = context.monitor
