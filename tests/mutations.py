@@ -77,7 +77,7 @@ MUTATIONS = [
     # inference/hierarchy.py, orbits.py: scales of their own that move along
     Mutation("jnp.sum(own + way - forth", "jnp.sum(own - forth", "test_orbits.py"),
     Mutation("jnp.exp(logs)) + logs - prior", "jnp.exp(logs)) - prior", "test_orbits.py"),
-    Mutation("orbit.volume * r + ratio", "orbit.volume * r", "test_orbits.py"),
+    Mutation("volumes[k] * r + ratio", "volumes[k] * r", "test_orbits.py"),
     # noise.py: what a density implies
     Mutation("return -e * self._slope(e)", "return e * self._slope(e)", "test_methods.py"),
     Mutation("slope**2 * density * np.cosh(t)", "slope**2 * density", "test_methods.py"),
@@ -110,7 +110,7 @@ MUTATIONS = [
     Mutation("on[0] = component.memoryless or not begins", "on[0] = True", "test_tails.py"),
     # inference/orbits.py
     Mutation("gain = gain - there + here", "gain = gain + 0.0 * (there + here)", "test_orbits.py"),
-    Mutation("density(at) + orbit.volume * r", "density(at)", "test_orbits.py"),
+    Mutation("density(at) + volumes[k] * r", "density(at)", "test_orbits.py"),
     # modes/mirrors.py, and crossing
     Mutation("return place - 2.0 * self.distance(place)", "return place - 1.0 * self.distance(place)", "test_mirrors.py"),
     # modes/crossings.py, explore.py, inference/pruned.py, analysis/segments.py
@@ -237,7 +237,10 @@ MUTATIONS = [
     Mutation("{f\"noise{suffix(self.problem, r)}\": u for", "{f\"noise{suffix(self.problem, r)}\": 0 * u for", "test_model.py"),
     Mutation("found |= own[0] if own else {}", "pass", "test_model.py"),
     Mutation(" - 0.5 * np.log(2 * np.pi) * normal", "", "test_svi.py"),
-    Mutation("min((chunk - self.begin + 1) * size", "min((chunk - self.begin) * size", "test_mixing.py"),
+    Mutation("np.clip(steps - method.warmup, 0", "np.clip(steps, 0", "test_mixing.py"),
+    Mutation("self.draws[::-2][::-1]", "self.draws[::2]", "test_mixing.py"),
+    Mutation("0.99 ** (1.0 / len(ess))", "0.99", "test_mixing.py"),
+    Mutation("wanted or min(ESS", "min(ESS", "test_mixing.py"),
     Mutation('self.found = numbered(part, "state"), chunks', 'self.found = numbered(part, "state"), chunks[:-1]', "test_storage.py"),
     # analysis/
     Mutation("(not status.settled, ", "(status is Status.DIVERGED, ", "test_guards.py"),

@@ -428,7 +428,10 @@ def test_the_recording_of_a_model_is_taken_where_none_is_given(model, rows):
     ("options", "text"),
     [
         (["--method", "collapsed", "--resume"], "--resume needs --out, the folder of the run to go on with"),
-        (["--method", "map", "--draws", "10"], '--draws: "map" draws no chains; take collapsed, nuts, gibbs or svi'),
+        (
+            ["--method", "map", "--draws", "10"],
+            '--draws: "map" draws no chains; take mcmc, collapsed, nuts, gibbs or svi',
+        ),
     ],
 )
 def test_options_of_samplers_are_checked(options, text, model, rows):

@@ -43,7 +43,7 @@ ERRORS = [  # of options and arguments, with the end of what is said
         "fit {plaza} --prior gaussian",
         "EA does not take the prior Gaussian; it takes: laplace, ard, ard-node, ard-owner",
     ),
-    ("fit {plaza} --chains 2", '--chains: "ea" draws no chains; take collapsed, nuts, gibbs or svi'),
+    ("fit {plaza} --chains 2", '--chains: "ea" draws no chains; take mcmc, collapsed, nuts, gibbs or svi'),
     ("fit {plaza} --method nuts --resume", "--resume needs --out, the folder of the run to go on with"),
     ("fit {plaza} --overwrite", "--overwrite needs --out, the folder whose run it replaces"),
     ("fit {plaza} README.md CHANGELOG.md", "several recordings need --out, the folder for a fit of each and the table"),

@@ -2,22 +2,23 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
 import probcal
-from probcal import Collapsed, Gaussian, Problem
+from probcal import MCMC, Collapsed, Gaussian, Gibbs, Problem
 from probcal.gaussian.frame import frame_at, log_joint, log_weight, unit_normals, volume
-from probcal.inference import sampling
+from probcal.inference import mcmc, sampling
 from probcal.inference.chains import Draw
 from probcal.inference.collapsed import CollapsedState
 from probcal.inference.hierarchy import hierarchy_of
 from probcal.inference.leaps import Place, leap
 from probcal.inference.mixed import Effective, effective_draws, mixing, r_hat_limit, weights_of_sides
 from probcal.inference.posed import Form, Posed, conditional, log_prior
-from probcal.inference.sampling import kept_of
+from probcal.inference.sampling import thinning
 from probcal.inference.sides import distances, shifted
 from probcal.modes import automatic_start
 from probcal.modes.grid import track_mode
@@ -61,11 +62,11 @@ def test_chains_that_agree_have_settled_and_others_have_not():
 @pytest.mark.parametrize(("warmup", "draws"), [(100, 500), (30, 70), (0, 1), (120, 131)])
 def test_a_chain_keeps_as_many_draws_as_asked_at_equal_steps(warmup, draws):
     """Draws are numbered by their step: none is of the warm-up, and of more steps they are as far apart."""
-    method, made, chunks, kept = Collapsed(warmup=warmup, draws=draws, patience=16), [], 0, kept_of(Collapsed(), 0)
+    method, made, chunks, kept = Collapsed(warmup=warmup, draws=draws, patience=16), [], 0, thinning(Collapsed(), 0)
     for thin in (1, 2, 4, 8):
         full = False
         while not full:
-            chunks, after = chunks + 1, kept_of(method, chunks + 1)
+            chunks, after = chunks + 1, thinning(method, chunks + 1)
             steps = kept.steps + after.thin * (1 + np.arange(method.chunk))
             made += steps[method.chunk - (after.held - kept.held) :].tolist()
             kept, full = after, after.full(method)
@@ -103,13 +104,48 @@ def test_what_has_not_mixed_goes_on_with_more_steps_and_is_resumed(tmp_path, mon
     again = drawn(store=tmp_path, resume=True)
     assert np.array_equal(again["posterior"]["bias"], longer["posterior"]["bias"])
 
-    def stop(at):
-        if at.done >= 250:
-            raise KeyboardInterrupt
-
-    short = drawn(progress=stop, store=tmp_path, overwrite=True)
+    short = drawn(progress=stopping(250), store=tmp_path, overwrite=True)
     assert (short.attrs["thin"], short["posterior"].sizes["draw"]) == (2, 100)
     assert np.array_equal(short["posterior"]["bias"][:, 1::2], longer["posterior"]["bias"][:, :50])
+
+
+def test_mcmc_takes_the_sampler_that_suits(monkeypatch):
+    network, motion, table, _ = plane()
+    problem, method = Problem(network, motion, table), MCMC(chains=3, warmup=7, draws=90, effective=80)
+    sizes = {"chains": 3, "warmup": 7, "draws": 90, "patience": 64, "effective": 80}
+    assert method.suited(problem) == Collapsed(**sizes)
+    monkeypatch.setattr(mcmc, "choose", lambda model: SimpleNamespace(cheap=False))
+    assert method.suited(problem) == Gibbs(**sizes)
+
+
+@pytest.mark.ci
+def test_mcmc_goes_on_until_enough_draws_are_effective(monkeypatch):
+    """Of few draws that are kept and more that are to be effective more steps are made; of many it ends early."""
+    found = drawn(MCMC(chains=2, warmup=50, draws=200, effective=390))
+    assert (found.attrs["requested"], found.attrs["method"], found.attrs["status"]) == (
+        "MCMC",
+        "Collapsed",
+        "converged",
+    )
+    assert found.attrs["thin"] > 1
+    assert found["calibration"]["ess"].min() >= 390
+    seen = []
+    quick = drawn(MCMC(chains=2, warmup=50, draws=1000, effective=100), progress=seen.append)
+    assert quick["posterior"].sizes["draw"] < 500
+    left = [at.left for at in seen if at.phase == "draws" and at.done]
+    assert left[-1] is not None, "how long it will take is said"
+    monkeypatch.setattr(sampling, "effective_draws", lambda *_: Effective(1.0, False))
+    slow = drawn(MCMC(chains=2, warmup=0, draws=100, effective=199), progress=stopping(200))
+    assert "Interrupted after 100 draws a chain, 2 steps each; --resume goes on." in slow.attrs["message"]
+    assert "effective draws of" in slow.attrs["message"]
+
+
+def stopping(steps):
+    def stop(at):
+        if at.done >= steps:
+            raise KeyboardInterrupt
+
+    return stop
 
 
 def two_sides():

@@ -30,6 +30,7 @@ CLIMBS = {
 }
 SAMPLERS = {
     "Collapsed": pc.Collapsed(chains=2, warmup=50, draws=100, sweeps=1),
+    "MCMC": pc.MCMC(chains=2, warmup=50, draws=100, effective=150),
     "NUTS": pc.NUTS(chains=2, warmup=25, draws=25),
     "Gibbs": pc.Gibbs(chains=2, warmup=10, draws=20),
     "SVI": pc.SVI(),

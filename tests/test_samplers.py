@@ -15,7 +15,7 @@ from scipy import stats
 from worlds import LINEAR, linear, resting
 
 import probcal
-from probcal import ARD, NUTS, SVI, BernoulliGaussian, Collapsed, Flat, Gaussian, Horseshoe, InputError, Laplace
+from probcal import ARD, MCMC, NUTS, SVI, BernoulliGaussian, Collapsed, Flat, Gaussian, Horseshoe, InputError, Laplace
 from probcal.analysis.assess import assess
 from probcal.gaussian.frame import frame_at, log_weight, place, unit_normals, volume
 from probcal.gaussian.information import at_levels
@@ -374,6 +374,11 @@ def test_wrong_settings_are_refused():
         NUTS(target=1.5)
     with pytest.raises(InputError, match=r"Collapsed\(patience=0\): it must be at least 1"):
         Collapsed(patience=0)
+    text = r"MCMC\(effective=201\): give a number from 1 to the 200 draws that 2 chains keep, or more draws"
+    with pytest.raises(InputError, match=text):
+        MCMC(chains=2, draws=100, effective=201)
+    with pytest.raises(InputError, match=r"MCMC\(effective=0\): give a number"):
+        MCMC(effective=0)
     with pytest.raises(InputError, match="it must be at least"):
         Collapsed(draws=0)
     with pytest.raises(InputError, match="chains are the most"):

@@ -9,7 +9,6 @@ the trajectories marginalised the data have a Gaussian log-likelihood of theta. 
 linear and Gaussian and no level is unknown; elsewhere `log_weight` says by how much they are wrong at a point.
 """
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -19,10 +18,11 @@ import numpy as np
 from probcal import linalg
 from probcal.gaussian import recursion as rec
 from probcal.gaussian.information import at_levels
+from probcal.gaussian.linearised import linearise_rows
 from probcal.gaussian.mode import (
+    Eliminated,
     Point,
-    compress,
-    eliminate_compressed,
+    eliminate_rows,
     factors,
     follow,
     log_density,
@@ -32,7 +32,7 @@ from probcal.gaussian.mode import (
 )
 from probcal.linalg import inverse_cholesky, multiply
 from probcal.model.model import Model, Recursion, scaled
-from probcal.model.rows import Linearised
+from probcal.model.rows import LinearRows
 from probcal.model.trajectories import States
 
 STEP = 0.05  # of a log level, for differences
@@ -113,7 +113,8 @@ def closed_loop(part: Recursion, L: jax.Array, J: jax.Array, score: jax.Array, u
     return Closed(feedback, factor / size[:, None, :], jnp.log(size), shift)
 
 
-def averaged(model: Model, frame: Frame, theta: jax.Array, eps: States) -> list[Linearised]:
+@jax.jit
+def averaged(model: Model, frame: Frame, theta: jax.Array, eps: States) -> LinearRows:
     """Every block linearised at the frame's point, with score and curvature averaged over draws.
 
     These are the moments of the best Gaussian approximation of the joint posterior (Opper, Archambeau 2009). Draws
@@ -130,49 +131,48 @@ def averaged(model: Model, frame: Frame, theta: jax.Array, eps: States) -> list[
 
     means = jax.tree.map(lambda leaf: jnp.mean(leaf, 0), jax.lax.map(pair, (theta, eps)))
     lins = model.linearise(frame.point, expected=True)
-    return [
+    return tuple(
         lin._replace(score=score, weight=jnp.maximum(curvature, 0.0))
         for lin, (score, curvature) in zip(lins, means, strict=True)
-    ]
+    )
 
 
-@jax.jit
-def _at(model: Model, point: Point, levels: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _at(model: Model, point: Point, levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Marginal log-likelihood (D,) and its slope by z (D, M) at levels (D, H), trajectories at their mode."""
 
-    def one(levels: jax.Array) -> tuple[jax.Array, jax.Array]:
-        moved = smooth_tracks(model, at_levels(model, point, levels))
-        lins = model.linearise(moved, expected=True)
-        solved = eliminate_compressed(model, moved.noises, levels, compress(model, lins))
+    def one(levels: np.ndarray) -> tuple[Any, Any]:
+        moved = smooth_tracks(model, at_levels(model, point, jax.device_put(levels)))
+        solved = eliminate_rows(model, moved, linearise_rows(model, moved))
         return log_density(model, moved) - 0.5 * solved.logdet, solved.score
 
-    return jax.lax.map(one, levels)
+    values, slopes = zip(*map(one, levels), strict=True)
+    return np.array(values), np.array(slopes)
 
 
-@jax.jit
 def frame_at(model: Model, point: Point) -> Frame:
     """The frame at a point whose trajectories are at their mode for its biases and levels."""
-    return _frame(model, point, model.linearise(point, expected=True))
+    return _frame(model, point, linearise_rows(model, point))
 
 
-@jax.jit
 def refined(model: Model, frame: Frame, theta: jax.Array, eps: States) -> Frame:
     """The frame with trajectories and curvature fitted to draws theta (D, Q), eps (D, E, n) of it (see `averaged`)."""
-    lins = averaged(model, frame, theta, eps)
-    compressed = compress(model, lins)
-    solved = eliminate_compressed(model, frame.point.noises, frame.point.levels, compressed)
+    solved = eliminate_rows(model, frame.point, averaged(model, frame, theta, eps))
     point = follow(model, frame.point, solved.parts, jnp.zeros_like(frame.point.z), free=True)
     return _frame(model, point, averaged(model, frame._replace(point=point), theta, eps))
 
 
-def _frame(model: Model, point: Point, lins: Sequence[Linearised]) -> Frame:
+def _frame(model: Model, point: Point, lins: LinearRows) -> Frame:
     """The frame of rows linearised at a point. By the log levels, differences of the marginal log-likelihood."""
-    compressed = compress(model, lins)
-    solved = eliminate_compressed(model, point.noises, point.levels, compressed)
+    levels = np.asarray(point.levels)
+    told = _at(model, point, levels + _moves(len(levels))) if len(levels) else (None, None)
+    return _framed(model, point, lins, eliminate_rows(model, point, lins), *told)
+
+
+@jax.jit
+def _framed(model: Model, point: Point, lins: LinearRows, solved: Eliminated, values: Any, slopes: Any) -> Frame:
     H = point.levels.shape[0]
     information, score = solved.information, solved.score
     if H:
-        values, slopes = _at(model, point, point.levels[None] + _moves(H))
         information, score = _with_levels(information, score, values, slopes, H)
     by_level = [
         model.of_states(scaled(lins, [data.level == h for data in model.rows])) for h in range(H if model.driven else 0)

@@ -98,8 +98,8 @@ class Collapsed(FramedSampler):
     Conjugate Gibbs for scale mixtures and for the Bernoulli-Gaussian, `sweeps` of it (None: as pays for the prior)
     a leap of each of `chains`, four leaps a draw. Biases and trajectories also move together, by a Hamiltonian swing.
     Where the frame fits badly it is moved; where that fails the joint sampler `NUTS` takes over if it has the prior.
-    Where draws have not mixed every second one is kept of twice as many steps, up to one of `patience` steps.
-    Raises `InputError` for less than one sweep or step.
+    Where draws have not mixed every second one is kept of twice as many steps, up to one of
+    `patience`. Raises `InputError` for less than one sweep or step.
     """
 
     chains: int = 4

@@ -71,7 +71,7 @@ def log_evidence(problem: Problem, *, prior: AnyPrior = None, key: Key = 0, star
     point = automatic_start(problem) if start is None else start
     form, posed, _, _ = pose(problem, chosen, point, keys[0], whole=True)
     runs = tempered_runs(form, posed, keys[1])
-    corrections = np.asarray(weights(posed, runs.theta, keys[2]))
+    corrections = np.asarray(weights(posed, runs.theta, jax.random.split(keys[2], len(runs.theta))))
     khat = pareto_khat(corrections)
     if khat > 0:
         smooth = smoothed(corrections[None])[0][0]

@@ -87,7 +87,7 @@ def effective_draws(draws: Draw, count: int, wanted: int = 0) -> Effective:
 
 
 def quantities(draws: Draw, names: Sequence[str], *, hyper: bool) -> tuple[list[str], np.ndarray]:
-    """Names, and values (chain, draw, P), of biases and levels, and of hyper-parameters by their logarithm."""
+    """Names, and values (chain, draw, P), of biases and levels, and logarithms of hyper-parameters."""
     theta = np.asarray(draws.theta)
     labels, values = list(names), [theta]
     for name, own in draws.phi.items() if hyper else ():
@@ -104,10 +104,11 @@ def side_of_draws(draws: Draw) -> np.ndarray:
 
 
 def r_hat_limit(ess: np.ndarray, chains: int) -> np.ndarray:
-    """The r_hat (P,) above which chains have not mixed: 1.01, or where it is larger what chance alone exceeds in 1 % of
-    the runs of so many quantities, of so many effective draws (P,).
+    """The r_hat (P,) above which chains have not mixed: 1.01, or if larger what chance exceeds in
+    1 % of the runs of so many quantities, of so many effective draws (P,).
 
-    Halves of `chains` have means whose variance over their expectation is chi-square over its degrees of freedom.
+    Halves of `chains` have means whose variance over its expectation is chi-square over its degrees
+    of freedom.
     """
     free = 2 * chains - 1
     chance = stats.chi2.ppf(0.99 ** (1.0 / len(ess)), free) / free

@@ -115,22 +115,30 @@ def roam(form: Form, posed: Posed, at: Place, key: jax.Array) -> tuple[Place, ja
         own = posed.frame.log_likelihood(place.theta) - 0.5 * sum(jnp.sum(e**2) for e in place.eps)
         return place.weight + own + log_prior(form, posed, place.theta, place.phi)
 
-    taken = jnp.zeros(())
-    for k, orbit in enumerate(posed.orbits):
+    if not posed.orbits:
+        return at, jnp.zeros(())
+    most = jnp.asarray([jnp.inf if orbit.kind == "shift" else TURNING for orbit in posed.orbits])
+    sizes, volumes = (jnp.stack([jnp.asarray(getattr(o, name)) for o in posed.orbits]) for name in ("size", "volume"))
+    moves = [partial(orbit.moved, posed) for orbit in posed.orbits]
+
+    def one(at: Place, k: jax.Array) -> tuple[Place, jax.Array]:
         pick, draw, renew, lot = jax.random.split(jax.random.fold_in(key, k), 4)
-        size = jax.random.choice(pick, jnp.asarray(SIZES)) * orbit.size
-        r = (size if orbit.kind == "shift" else jnp.minimum(size, TURNING)) * jax.random.normal(draw)
-        point = orbit.moved(posed, r, place(posed.model, posed.frame, at.theta, at.eps))
+        size = jax.random.choice(pick, jnp.asarray(SIZES)) * sizes[k]
+        r = jnp.minimum(size, most[k]) * jax.random.normal(draw)
+        point = place(posed.model, posed.frame, at.theta, at.eps)
+        point = jax.tree.map(partial(jax.lax.select_n, k), *(move(r, point) for move in moves))
         theta, eps = jnp.concatenate([point.z, point.levels]), unit_normals(posed.model, posed.frame, point)
         phi, ratio = form.hierarchy.renewed(at.phi, at.theta[learnt], theta[learnt], renew)
         tried = Place(theta, eps, phi, log_weight(posed.model, posed.frame, theta, eps))
-        gain = density(tried) - density(at) + orbit.volume * r + ratio
-        if orbit.levels:  # the frame spreads eps otherwise at other levels
+        gain = density(tried) - density(at) + volumes[k] * r + ratio
+        if any(orbit.levels for orbit in posed.orbits):  # the frame spreads eps otherwise at other levels
             there, here = (volume(posed.model, posed.frame, one.theta) for one in (tried, at))
             gain = gain - there + here
-        moves = accepted(lot, gain)
-        at, taken = chosen(moves, tried, at), taken + moves
-    return at, taken / max(len(posed.orbits), 1)
+        taken = accepted(lot, gain)
+        return chosen(taken, tried, at), taken.astype(float)
+
+    at, taken = jax.lax.scan(one, at, jnp.arange(len(moves)))
+    return at, jnp.mean(taken)
 
 
 def orbits_of(problem: Problem, posed: Posed, covariance: np.ndarray) -> tuple[Orbit, ...]:

@@ -16,12 +16,13 @@ from probcal.inference.hierarchy import Phi, hierarchy_of
 from probcal.inference.posed import Form, Posed, activity, conditional
 from probcal.inference.psis import smoothed
 from probcal.model.model import Model
+from probcal.model.trajectories import States
 from probcal.priors import Prior
 from probcal.problem import Problem
 
 PILOTS = 4  # chains of the pilot
 BURN, KEPT, STRIDE = 100, 100, 4  # sweeps before, draws kept of each pilot, sweeps between two
-MOVES = 4  # most times that the frame is moved
+MOVES = 1  # of a frame; further ones made few frames better, and some worse
 FITS, GOOD = 0.5, 0.9  # Pareto k-hat and acceptance of a new theta at which a frame is left alone
 SCARCE = 0.1  # acceptance below which it has failed: leaps are rare
 ROUNDS = 4  # trajectories at which that acceptance is judged, each by as small a part of the draws
@@ -82,38 +83,40 @@ def pilot(form: Form, posed: Posed, key: jax.Array) -> Pilot:
 
 
 @jax.jit
-def weights(posed: Posed, theta: jax.Array, key: jax.Array) -> jax.Array:
-    """Log weights (D,) of draws theta (D, Q) with trajectories drawn from the frame."""
+def weights(posed: Posed, theta: jax.Array, keys: jax.Array) -> jax.Array:
+    """Log weights (D,) of draws theta (D, Q), trajectories drawn from the frame by keys (D,)."""
 
     def one(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
         eps = posed.frame.normals(jax.random.split(pair[1], len(posed.frame.loops)))
         return log_weight(posed.model, posed.frame, pair[0], eps)
 
-    return jax.lax.map(one, (theta, jax.random.split(key, theta.shape[0])))
+    return jax.lax.map(one, (theta, keys))
 
 
-@jax.jit
 def weights_along(posed: Posed, theta: jax.Array, key: jax.Array) -> jax.Array:
     """Log weights (ROUNDS, D) of draws theta (D, Q), all of a round with the same trajectories from the frame."""
+    keys = jax.random.split(key, ROUNDS)[np.repeat(np.arange(ROUNDS), len(theta))]
+    return weights(posed, jnp.tile(theta, (ROUNDS, 1)), keys).reshape(ROUNDS, -1)
 
-    def one(key: jax.Array) -> jax.Array:
-        eps = posed.frame.normals(jax.random.split(key, len(posed.frame.loops)))
-        return jax.lax.map(lambda own: log_weight(posed.model, posed.frame, own, eps), theta)
 
-    return jax.lax.map(one, jax.random.split(key, ROUNDS))
+def moved(model: Model, frame: Frame, theta: jax.Array, key: jax.Array) -> Frame:
+    """The frame at the mean of draws theta (D, Q), trajectories at their mode, then fitted to the draws."""
+    frame = frame_at(model, smooth_tracks(model, _middle(model, frame, theta)))
+    for k in range(FITTINGS):
+        eps = _fitting(frame, jax.random.fold_in(key, k))
+        frame = refined(model, frame, theta[:: theta.shape[0] // FITTED][:FITTED], eps)
+    return frame
 
 
 @jax.jit
-def moved(model: Model, frame: Frame, theta: jax.Array, key: jax.Array) -> Frame:
-    """The frame at the mean of draws theta (D, Q), trajectories at their mode, then fitted to the draws."""
+def _middle(model: Model, frame: Frame, theta: jax.Array) -> Point:
     resting = tuple(jnp.zeros_like(x) for x in frame.point.states)
-    mean = jnp.mean(theta, 0)
-    frame = frame_at(model, smooth_tracks(model, place(model, frame, mean, resting)))
-    for k in range(FITTINGS):
-        keys = jax.random.split(jax.random.fold_in(key, k), (FITTED, len(resting)))
-        eps = jax.vmap(frame.normals)(keys)
-        frame = refined(model, frame, theta[:: theta.shape[0] // FITTED][:FITTED], eps)
-    return frame
+    return place(model, frame, jnp.mean(theta, 0), resting)
+
+
+@jax.jit
+def _fitting(frame: Frame, key: jax.Array) -> States:
+    return jax.vmap(frame.normals)(jax.random.split(key, (FITTED, len(frame.loops))))
 
 
 def pareto_khat(log_weights: np.ndarray) -> float:
@@ -148,7 +151,7 @@ def pose(
     for move in range(MOVES + 1):
         keys = jax.random.split(jax.random.fold_in(key, move), 3)
         found = pilot(form, posed, keys[0])
-        logs = np.asarray(weights(posed, found.theta, keys[1]))
+        logs = np.asarray(weights(posed, found.theta, jax.random.split(keys[1], len(found.theta))))
         held = np.asarray(weights_along(posed, found.theta[::ROUNDS], keys[1]))
         worth = Worth(pareto_khat(logs), float(np.mean([acceptance(own) for own in held])), acceptance(logs), move)
         if best is None or worth.order(whole=whole) > best[2].order(whole=whole):

@@ -230,7 +230,7 @@ def _stats(run: SamplerRun) -> dict[str, np.ndarray]:
 
 
 def facts_of(names: Sequence[str], run: SamplerRun, mixed: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """The facts that a run says of its draws of named quantities, in the names of `probcal.status.CHAINS`."""
+    """Facts of the draws of named quantities, in the names of `probcal.status.CHAINS`."""
     count, draws, wanted = *run.z.shape[:2], run.method.effective
     facts = {"note": run.note} | mixed_of(names, mixed, count, r_hat_limit(mixed["ess"], count), wanted)
     if run.stopped:
@@ -247,8 +247,8 @@ def facts_of(names: Sequence[str], run: SamplerRun, mixed: Mapping[str, np.ndarr
 def mixed_of(
     names: Sequence[str], mixed: Mapping[str, np.ndarray], chains: int, limit: Any, wanted: int = 0
 ) -> dict[str, Any]:
-    """Quantities whose chains have not mixed, or have fewer effective draws than `wanted`, worst first; `limit` is of
-    each r_hat."""
+    """Quantities whose chains have not mixed, or have fewer effective draws than `wanted`, worst
+    first; `limit` is of each r_hat."""
     facts, few = dict[str, Any](), int(mixed["ess"].argmin())
     if "r_hat" in mixed:
         above = mixed["r_hat"] - limit

@@ -9,12 +9,14 @@ import jax
 import jax.numpy as jnp
 
 from probcal.errors import InputError
+from probcal.inference import hierarchy
 from probcal.inference.chains import Sample
 from probcal.inference.hierarchy import Phi
 from probcal.inference.leaps import Place
 from probcal.inference.method import Method
 from probcal.inference.posed import Form, Posed
 from probcal.priors import ARD, Prior
+from probcal.problem import Problem
 
 CHAINS, DRAWS = 4_096, 10_000_000  # the most; draws with warm-up, of all chains
 
@@ -34,7 +36,7 @@ class Sampler(Method, ABC):
     warmup: int
     draws: int
     chunk: ClassVar[int]  # draws between two checkpoints
-    effective: int = 0  # draws of every quantity at which the chains end before `draws`; 0: at `draws` of each chain
+    effective: int = 0  # draws of every quantity at which the chains end; 0: at `draws` of each
     patience: int = 1  # most steps from one draw to the next, where those after fewer have not mixed
     exact: ClassVar[bool] = True  # whether its draws are those of the posterior
     atoms: ClassVar[bool] = False  # whether it takes priors under which a bias may be exactly zero
@@ -55,6 +57,11 @@ class Sampler(Method, ABC):
         return (
             super().takes(prior) and (prior.dense or self.atoms) and not (isinstance(prior, ARD) and prior.rate == 0.0)
         )
+
+    def suited(self, problem: Problem) -> Method:
+        """The sampler, numpyro loaded: loaded later it would have all kernels traced again."""
+        hierarchy.dist.Distribution  # noqa: B018
+        return self
 
     def kernel(self) -> Sampler:
         """The method without what does not change its kernels, so that these are compiled once."""

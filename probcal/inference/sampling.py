@@ -49,9 +49,9 @@ class DrawnChunks(tuple[Mapping[str, np.ndarray], ...]):
         return DrawnChunks((*self, *other))
 
 
-class Kept(NamedTuple):
-    """What is kept of the chunks of a chain: every draw, and where as many as asked have not mixed every second one of
-    twice as many steps, and so on."""
+class Thinning(NamedTuple):
+    """Draws that are kept of the chunks of a chain: every one, and where as many as asked have not
+    mixed every second one of twice as many steps, and so on."""
 
     draws: np.ndarray  # (D,) numbers of the draws, of all that the chunks hold
     thin: int  # steps from one to the next
@@ -62,17 +62,17 @@ class Kept(NamedTuple):
         """Whether these are all that a method keeps."""
         return len(self.draws) >= method.draws
 
-    def after(self, method: Sampler) -> Kept:
+    def after(self, method: Sampler) -> Thinning:
         """The same after one more chunk."""
         own, thin = (self.draws[::-2][::-1], 2 * self.thin) if self.full(method) else (self.draws, self.thin)
         steps = self.steps + method.chunk * thin
         new = self.held + np.arange(np.clip(steps - method.warmup, 0, method.chunk))
-        return Kept(np.append(own, new)[: method.draws], thin, steps, self.held + len(new))
+        return Thinning(np.append(own, new)[: method.draws], thin, steps, self.held + len(new))
 
 
-def kept_of(method: Sampler, chunks: int) -> Kept:
+def thinning(method: Sampler, chunks: int) -> Thinning:
     """What is kept of so many chunks."""
-    found = Kept(np.arange(0), 1, 0, 0)
+    found = Thinning(np.arange(0), 1, 0, 0)
     for _ in range(chunks):
         found = found.after(method)
     return found
@@ -106,7 +106,7 @@ class Chains(MethodTask):
 
     def step(self, state: Any, count: int, pause: Pause) -> tuple[Any, DrawnChunks]:
         """One more chunk."""
-        self._enter(kept := kept_of(self.method, count))
+        self._enter(kept := thinning(self.method, count))
         after = kept.after(self.method)
         state, draws = self.advance(state, after.thin)
         # draws as arrays (chains, draws, ...) by flat names, as a storage keeps them
@@ -119,9 +119,9 @@ class Chains(MethodTask):
         return state, DrawnChunks([last | {MEAN: np.mean(arrays["density"])}])
 
     def ended(self, state: Any, course: DrawnChunks) -> bool:
-        """True where there are enough effective draws, or the method has no patience for more steps."""
-        method, kept = self.method, kept_of(self.method, len(course))
-        last = kept_of(method, len(course) - 1)
+        """True where enough draws are effective, or the method has no patience for more steps."""
+        method, kept = self.method, thinning(self.method, len(course))
+        last = thinning(method, len(course) - 1)
         look = kept.full(method) or (
             method.effective and len(kept.draws) >= FIRST and _octave(kept.steps) > _octave(last.steps)
         )
@@ -138,8 +138,8 @@ class Chains(MethodTask):
         return DrawnChunks(stored)
 
     def tell(self, monitor: Monitor, done: int, objective: float) -> None:
-        """Report the steps made, of those until all draws are made or, as it looks so far, enough are effective."""
-        kept, method = kept_of(self.method, done), self.method
+        """Report the steps made, of those until all draws are made or, so far, enough effective."""
+        kept, method = thinning(self.method, done), self.method
         self._enter(kept)
         drawn = method.draws * kept.thin
         if method.effective:  # known from the first look on
@@ -147,7 +147,7 @@ class Chains(MethodTask):
         total = method.warmup + drawn
         monitor.tell(self.name, kept.steps, max(total, kept.steps), objective)
 
-    def _enter(self, kept: Kept) -> None:
+    def _enter(self, kept: Thinning) -> None:
         thin = kept.after(self.method).thin
         phase = "draws" if thin == 1 else f"draws, {thin} steps each"
         phase = WARM_UP if not len(kept.draws) and self.method.warmup else phase
@@ -160,8 +160,8 @@ class Chains(MethodTask):
         return conclude_draws(self.problem, self.prior, self.run(course))
 
     def run(self, course: DrawnChunks) -> SamplerRun:
-        """The draws of a course; raises `FitError` where there are none yet, and where some are not finite."""
-        kept, stopped = kept_of(self.method, len(course)), "" if self.complete else self.context.monitor.stopped
+        """The draws of a course; raises `FitError` where there are none or some are not finite."""
+        kept, stopped = thinning(self.method, len(course)), "" if self.complete else self.context.monitor.stopped
         if not len(kept.draws):
             raise FitError(f"{stopped} in the warm-up, before there was a draw: give a longer limit, or fewer steps")
         drawn, seconds = self._drawn(course, kept), time.perf_counter() - self.began
@@ -175,7 +175,7 @@ class Chains(MethodTask):
         )  # fmt: skip
 
     @staticmethod
-    def _drawn(course: DrawnChunks, kept: Kept) -> Draw:
+    def _drawn(course: DrawnChunks, kept: Thinning) -> Draw:
         """The draws that are kept of a course."""
         names = [name for name in course[-1] if name != MEAN]
         return gathered({name: np.concatenate([one[name] for one in course], 1)[:, kept.draws] for name in names})

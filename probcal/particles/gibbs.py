@@ -184,8 +184,8 @@ class ParticleGibbs(Sampler):
     A sweep draws every path anew by a conditional filter of `particles` with ancestor sampling, then takes `steps` of
     the biases at given paths: of all together, by Gauss-Newton proposals, and of each sensor by itself, near and far,
     which given the paths knows nothing of the others. The motion needs a density. Where draws
-    have not mixed every second one is kept of twice as many sweeps, up to one of `patience` sweeps. Raises
-    `InputError` for settings outside their ranges.
+    have not mixed every second one is kept of twice as many sweeps, up to one of `patience`.
+    Raises `InputError` for settings outside their ranges.
     """
 
     chains: int = 4
