@@ -49,7 +49,7 @@ CASES = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize("case", CASES)
 def test_an_orbit_is_a_group_that_leaves_what_the_sensors_see(case):
     problem, _, made, orbits = posed(*case)
@@ -60,7 +60,7 @@ def test_an_orbit_is_a_group_that_leaves_what_the_sensors_see(case):
         random = np.random.default_rng(0)
         theta = jnp.asarray(made.frame.theta + 0.1 * random.normal(size=made.frame.theta.shape))
         eps = tuple(jnp.asarray(random.normal(size=x.shape)) for x in made.frame.point.states)
-        point = place(problem.model, made.frame, theta, eps)
+        point = jax.device_put(place(problem.model, made.frame, theta, eps))
         before = problem.model.predict(point)
         for orbit in orbits:
             there = orbit.moved(made, jnp.asarray(0.3), point)
@@ -74,7 +74,7 @@ def test_an_orbit_is_a_group_that_leaves_what_the_sensors_see(case):
                     np.testing.assert_allclose(np.sin(gone) if d == 2 else gone, 0.0, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize("case", CASES)
 def test_its_volume_is_the_determinant_of_its_derivative(case):
     problem, _, made, orbits = posed(*case)
@@ -111,7 +111,7 @@ def made_volume(problem, made, theta, orbit, r):
     return float(volume(problem.model, made.frame, moved) - volume(problem.model, made.frame, theta))
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.needs("studies")
 @pytest.mark.parametrize(
     ("case", "prior", "runs"),
