@@ -91,6 +91,7 @@ VERBS = {  # what each answers in numbers to the world, by the fit of an engine 
 ENGINED = ("EA", "EMEA", "EM", "MAP", "LeastSquares")
 OWN = {name: lambda engine, name=name: getattr(pc, name)(engine=named(engine)) for name in ENGINED} | {
     "Gibbs": lambda engine: pc.Gibbs(chains=2, warmup=10, draws=10),
+    "MCMC": lambda engine: pc.MCMC(chains=2, warmup=10, draws=10, effective=1),
     "SelfConfiguration": lambda engine: pc.SelfConfiguration(pc.MAP(engine=named(engine))),
 }
 METHODS = {name: OWN.get(name, lambda engine, name=name: getattr(pc, name)()) for name in of_priors().index}
@@ -105,7 +106,8 @@ NOT = {  # what is not done, by the heading of a column: part of the sentence th
 }  # fmt: skip
 
 APART = {("bound_map", "many"): 0.2}  # share of numbers, of sensors taken as independent
-BY_SIZE = {"bounds", "next_passes", "next_anchors", "next_sensors", "sensitivity", "Gibbs"}  # nobody asks them for one
+# nobody asks these for one
+BY_SIZE = {"bounds", "next_passes", "next_anchors", "next_sensors", "sensitivity", "Gibbs", "MCMC"}
 
 
 def table():

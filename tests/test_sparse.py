@@ -746,7 +746,7 @@ def test_tracks_under_heavy_tails_are_those_of_the_dense_engine(library, monkeyp
 
 FORCED = ("cholmod", *(pytest.param(name, marks=pytest.mark.ci) for name in ("superlu", "many", "iterative")))
 SHORT = {"fit", "next_anchors", "changes", "compare", *engines.NOT} - {"observability", "EA", "EMEA"}
-TIERS = dict.fromkeys(("EA", "Gibbs"), pytest.mark.slow) | dict.fromkeys(SHORT, ())
+TIERS = dict.fromkeys(("EA", "Gibbs", "MCMC"), pytest.mark.slow) | dict.fromkeys(SHORT, ())
 CELLS = [pytest.param(name, marks=TIERS.get(name, pytest.mark.ci)) for name in (*engines.VERBS, *engines.METHODS)]
 
 
