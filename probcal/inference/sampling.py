@@ -59,7 +59,7 @@ class Thinning(NamedTuple):
     held: int  # draws that the chunks hold
 
     def full(self, method: Sampler) -> bool:
-        """Whether these are all that a method keeps."""
+        """True where these are all that a method keeps."""
         return len(self.draws) >= method.draws
 
     def after(self, method: Sampler) -> Thinning:
@@ -71,7 +71,7 @@ class Thinning(NamedTuple):
 
 
 def thinning(method: Sampler, chunks: int) -> Thinning:
-    """What is kept of so many chunks."""
+    """The draws that are kept of so many chunks."""
     found = Thinning(np.arange(0), 1, 0, 0)
     for _ in range(chunks):
         found = found.after(method)
@@ -123,7 +123,7 @@ class Chains(MethodTask):
         method, kept = self.method, thinning(self.method, len(course))
         last = thinning(method, len(course) - 1)
         look = kept.full(method) or (
-            method.effective and len(kept.draws) >= FIRST and _octave(kept.steps) > _octave(last.steps)
+            method.effective and len(kept.draws) >= FIRST and _growth(kept.steps) > _growth(last.steps)
         )
         if len(course) and look:
             drawn = self._drawn(course, kept)
@@ -181,7 +181,7 @@ class Chains(MethodTask):
         return gathered({name: np.concatenate([one[name] for one in course], 1)[:, kept.draws] for name in names})
 
 
-def _octave(steps: int) -> int:
+def _growth(steps: int) -> int:
     """A number that grows by 1 where steps grow by a quarter."""
     return int(np.log(max(steps, 1)) / np.log(1.25))
 
