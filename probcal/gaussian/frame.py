@@ -1,12 +1,14 @@
 """A Gaussian frame of the posterior: coordinates in which biases and trajectories are nearly independent normals.
 
-At a point the trajectories given the biases are Gaussian with a block-tridiagonal precision. They are written as a
-response to the biases plus a closed loop driven by independent unit normals `eps`: u_k = -K_k x_{k-1} + C_k eps_k,
-the factor of the posterior that a backward information pass gives (the control form of the Kalman smoother). Where a
-process noise is unknown the pass is made anew at every level: a track that the data hardly hold widens with its
-process noise, one that they hold does not, and neither leaves a funnel. theta is the biases z and the log levels. With
-the trajectories marginalised the data have a Gaussian log-likelihood of theta. Both are exact where the problem is
-linear and Gaussian and no level is unknown; elsewhere `log_weight` says by how much they are wrong at a point.
+At a point the trajectories given the biases are Gaussian with a block-tridiagonal precision. They
+are written as a response to the biases plus a closed loop driven by independent unit normals `eps`:
+u_k = -K_k x_{k-1} + C_k eps_k, the factor of the posterior that a backward information pass gives
+(the control form of the Kalman smoother). Where a process noise is unknown the pass is made at some
+values of each level, and interpolated: a track that the data hardly hold widens with its process
+noise, one that they hold does not, and neither leaves a funnel. theta is the biases z and the log
+levels. With the trajectories marginalised the data have a Gaussian log-likelihood of theta. Both are
+exact where the problem is linear and Gaussian and no level is unknown; elsewhere `log_weight` says
+by how much they are wrong at a point.
 """
 
 from typing import Any, NamedTuple
@@ -36,6 +38,7 @@ from probcal.model.rows import LinearRows
 from probcal.model.trajectories import States
 
 STEP = 0.05  # of a log level, for differences
+FARTHEST = 4  # log levels from the point up to which its closed loops are known, one at each unit
 
 
 class Closed(NamedTuple):
@@ -53,9 +56,8 @@ class Loop(NamedTuple):
     states: jax.Array  # (E, n, M) response of the states to the biases
     noises: jax.Array  # (E, n, M) response of the whitened noises
     closed: Closed  # at the levels of the point
-    data: tuple[jax.Array, jax.Array]  # (E, n, n) information of the data about the states, (E, n) their score
-    shares: tuple[jax.Array, jax.Array]  # the same with H leading, by the unknown level that the noise of a datum has;
-    # none where the process noise is known: data tell their own noise so well that one loop serves
+    by_level: Closed  # at one level moved by each of `LEVELS` (H, L, E, ...); none where the process noise is known:
+    # data tell their own noise so well that one loop serves
 
 
 class Frame(NamedTuple):
@@ -174,21 +176,43 @@ def _framed(model: Model, point: Point, lins: LinearRows, solved: Eliminated, va
     information, score = solved.information, solved.score
     if H:
         information, score = _with_levels(information, score, values, slopes, H)
-    by_level = [
+    shares = [
         model.of_states(scaled(lins, [data.level == h for data in model.rows])) for h in range(H if model.driven else 0)
     ]
     loops = []
     for r, (part, kept) in enumerate(model.each_layout(solved.parts)):
-        L, J, pull = factors(part, point.levels), kept.J, kept.pull
         smooth = rec.smooth(part.F, kept.gain, kept.cross)
-        closed = closed_loop(part, L, J, pull, point.noises[r])
-        closed = closed._replace(shift=jnp.zeros_like(pull))  # the point is the mean, by definition
-        own = [share[r] for share in by_level]
-        none = jnp.zeros((0, *J.shape)), jnp.zeros((0, *pull.shape))
-        shares = jax.tree.map(lambda *each: jnp.stack(each), *own) if own else none
-        loops.append(Loop(-smooth.states, -smooth.noises, closed, (J, pull), shares))
+        closed = closed_loop(part, factors(part, point.levels), kept.J, kept.pull, point.noises[r])
+        closed = closed._replace(shift=jnp.zeros_like(kept.pull))  # the point is the mean, by definition
+        own = jax.tree.map(lambda *each: jnp.stack(each), *[share[r] for share in shares]) if shares else None
+        by_level = _at_levels(part, point.levels, kept.J, kept.pull, own, point.noises[r])
+        loops.append(Loop(-smooth.states, -smooth.noises, closed, by_level))
     height = log_density(model, point) - 0.5 * solved.logdet
     return Frame(point, information, score, height, tuple(loops))
+
+
+LEVELS = np.arange(-FARTHEST - 1.0, FARTHEST + 2.0)  # two more, for the slopes of the interpolation at the ends
+
+
+def _at_levels(part: Recursion, levels: jax.Array, J: jax.Array, score: jax.Array, shares: Any, u: jax.Array) -> Closed:
+    """The loops of one recursion where one level is moved, of shares (H, E, ...) of J and score that have its noise."""
+    H = 0 if shares is None else levels.shape[0]
+
+    def at(step: jax.Array) -> Closed:
+        less = jnp.expm1(-2 * step)
+        data, pull = (whole + jnp.tensordot(less, own, 1) for whole, own in zip((J, score), shares, strict=True))
+        return closed_loop(part, factors(part, levels + step), data, pull, u / jnp.exp(_wider(part, step)))
+
+    if H == 0:
+        none = jnp.zeros((0, len(LEVELS), *u.shape), u.dtype)
+        return Closed(none, none, none, none)
+    steps = jnp.asarray(np.eye(H)[:, None, :] * LEVELS[None, :, None]).reshape(-1, H)
+    return jax.tree.map(lambda leaf: leaf.reshape(H, len(LEVELS), *leaf.shape[1:]), jax.lax.map(at, steps))
+
+
+def _wider(part: Recursion, step: jax.Array) -> jax.Array:
+    """By how much the log of each noise (E, n) of a recursion grows where log levels (H,) move."""
+    return jnp.concatenate([step, jnp.zeros(1)])[part.level]
 
 
 def _moves(H: int) -> np.ndarray:
@@ -221,24 +245,29 @@ def _with_levels(
 
 
 def _closed(model: Model, frame: Frame, theta: jax.Array) -> list[Closed]:
-    """The closed loops of all recursions at the levels of theta (Q,): stable whatever these are."""
+    """The closed loops of all recursions at the levels of theta (Q,), cubic between those that are known."""
     step = theta[frame.point.z.shape[0] :] - frame.point.levels
-    if frame.loops[0].shares[0].shape[0] == 0:
+    if frame.loops[0].by_level.size.shape[0] == 0:
         return [loop.closed for loop in frame.loops]
-    change = jnp.concatenate([step, jnp.zeros(1)])
+    place = jnp.clip(step - LEVELS[0], 1, 2 * FARTHEST + 1)
+    first = jnp.minimum(place.astype(int), 2 * FARTHEST) - 1
+    t = place - first - 1
+    cubic = jnp.array([[0.0, -0.5, 1.0, -0.5], [1.0, 0.0, -2.5, 1.5], [0.0, 0.5, 2.0, -1.5], [0.0, 0.0, -0.5, 0.5]])
+    weight = jnp.stack([t**0, t, t**2, t**3], 1) @ cubic.T  # (H, 4), by Catmull and Rom
 
-    def closed(part: Recursion, loop: Loop, u: jax.Array) -> Closed:
-        J, pull = (
-            whole + jnp.tensordot(jnp.expm1(-2 * step), own, 1)
-            for whole, own in zip(loop.data, loop.shares, strict=True)
-        )
-        wider = change[part.level]
+    def closed(part: Recursion, loop: Loop) -> Closed:
+        def at(leaf: jax.Array) -> jax.Array:
+            near = [jax.lax.dynamic_slice_in_dim(own, k, 4) for own, k in zip(leaf, first, strict=True)]
+            moved = sum(jnp.tensordot(w, own, 1) for w, own in zip(weight, near, strict=True))
+            return moved - (len(near) - 1) * leaf[0, FARTHEST + 1]
+
+        own = Closed(*map(at, loop.by_level))
+        wider = _wider(part, step)
         ratio = jnp.exp(wider)
-        at = closed_loop(part, factors(part, frame.point.levels + step), J, pull, u / ratio)
         column = ratio[:, :, None]
-        return Closed(column * at.feedback, at.factor * column / column.mT, at.size + wider, ratio * at.shift)
+        return Closed(column * own.feedback, own.factor * column / column.mT, own.size + wider, ratio * own.shift)
 
-    return list(model.each(closed, frame.loops, frame.point.noises))
+    return list(model.each(closed, frame.loops))
 
 
 def place(model: Model, frame: Frame, theta: jax.Array, eps: States) -> Point:
@@ -255,17 +284,15 @@ def _placed(model: Model, frame: Frame, theta: jax.Array, eps: States, loops: li
     ) -> tuple[jax.Array, jax.Array]:
         L = factors(part, frame.point.levels)
         own = at.shift + jnp.einsum("eij,ej->ei", at.factor, jnp.exp(at.size) * e)
-        closed, driven = part.F - L @ at.feedback, jnp.einsum("eij,ej->ei", L, own)
 
-        def forward(deviation: jax.Array, epoch: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
-            T_k, s_k = epoch
-            following = jnp.sum(T_k * deviation[None, :], 1) + s_k
-            return following, deviation
+        def forward(deviation: jax.Array, epoch: tuple[jax.Array, ...]) -> tuple[jax.Array, Any]:
+            F_k, L_k, K_k, own_k = epoch
+            driven = own_k - jnp.sum(K_k * deviation[None, :], 1)
+            deviation = jnp.sum(F_k * deviation[None, :], 1) + jnp.sum(L_k * driven[None, :], 1)
+            return deviation, (deviation, driven)
 
-        last, before = jax.lax.scan(forward, jnp.zeros_like(x[0]), (closed, driven))
-        deviations = jnp.concatenate([before[1:], last[None]])
-        noises = u + loop.noises @ step + own - jnp.einsum("eij,ej->ei", at.feedback, before)
-        return x + loop.states @ step + deviations, noises
+        _, (deviations, driven) = jax.lax.scan(forward, jnp.zeros_like(x[0]), (part.F, L, at.feedback, own))
+        return x + loop.states @ step + deviations, u + loop.noises @ step + driven
 
     tracks = frame.point.trajectories.map(placed, model.recursions, frame.loops, loops, eps)
     point = Point(tracks, theta[:M], frame.point.levels)

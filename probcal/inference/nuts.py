@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 else:
     hmc = Later("numpyro.infer.hmc")
 
+WARMING = 7  # doublings of a tree at most while step size and metric adapt
+
 
 @dataclass(frozen=True)
 class NUTS(FramedSampler):
@@ -63,7 +65,7 @@ class NUTS(FramedSampler):
     def _started(self, kernels: tuple[Any, Any], free: Free, key: jax.Array) -> Any:
         return kernels[0](
             free, self.warmup, step_size=0.3, dense_mass=self.dense, target_accept_prob=self.target,
-            max_tree_depth=self.depth, rng_key=key,
+            max_tree_depth=(min(self.depth, WARMING), self.depth), rng_key=key,
         )  # fmt: skip
 
     def kernel(self) -> NUTS:
