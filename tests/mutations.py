@@ -148,7 +148,7 @@ MUTATIONS = [
     # identifiability/gauge.py
     Mutation("moved.append(-x)", "moved.append(0 * x)", "test_observability.py"),
     # gaussian/frame.py
-    Mutation("step + own - jnp.einsum(\"eij,ej->ei\", at.feedback, before)", "step + own + jnp.einsum(\"eij,ej->ei\", at.feedback, before)", "test_samplers.py test_model.py"),
+    Mutation("driven = own_k - jnp.sum", "driven = own_k + jnp.sum", "test_samplers.py test_model.py"),
     Mutation("self.score @ step - 0.5 * step", "self.score @ step + 0.5 * step", "test_samplers.py"),
     Mutation("loops.append(Loop(-smooth.states,", "loops.append(Loop(smooth.states,", "test_samplers.py"),
     Mutation("cross = -(slopes", "cross = (slopes", "test_formulas.py"),

@@ -38,7 +38,7 @@ from probcal.model.rows import LinearRows
 from probcal.model.trajectories import States
 
 STEP = 0.05  # of a log level, for differences
-FARTHEST = 4  # log levels from the point up to which its closed loops are known, one at each unit
+FARTHEST, APART = 6, 0.5  # closed loops that are known on either side of a log level, and from one to the next
 
 
 class Closed(NamedTuple):
@@ -191,7 +191,7 @@ def _framed(model: Model, point: Point, lins: LinearRows, solved: Eliminated, va
     return Frame(point, information, score, height, tuple(loops))
 
 
-LEVELS = np.arange(-FARTHEST - 1.0, FARTHEST + 2.0)  # two more, for the slopes of the interpolation at the ends
+LEVELS = APART * np.arange(-FARTHEST - 1, FARTHEST + 2)  # two more, for the slopes of the interpolation at the ends
 
 
 def _at_levels(part: Recursion, levels: jax.Array, J: jax.Array, score: jax.Array, shares: Any, u: jax.Array) -> Closed:
@@ -249,7 +249,7 @@ def _closed(model: Model, frame: Frame, theta: jax.Array) -> list[Closed]:
     step = theta[frame.point.z.shape[0] :] - frame.point.levels
     if frame.loops[0].by_level.size.shape[0] == 0:
         return [loop.closed for loop in frame.loops]
-    place = jnp.clip(step - LEVELS[0], 1, 2 * FARTHEST + 1)
+    place = jnp.clip((step - LEVELS[0]) / APART, 1, 2 * FARTHEST + 1)
     first = jnp.minimum(place.astype(int), 2 * FARTHEST) - 1
     t = place - first - 1
     cubic = jnp.array([[0.0, -0.5, 1.0, -0.5], [1.0, 0.0, -2.5, 1.5], [0.0, 0.5, 2.0, -1.5], [0.0, 0.0, -0.5, 0.5]])

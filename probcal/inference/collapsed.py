@@ -128,7 +128,9 @@ class Collapsed(FramedSampler):
 
     def instead(self, prior: Prior, fallback: Any) -> Sampler | None:
         """The fallback where it has the prior."""
-        own = {"patience": self.patience, "effective": self.effective} if self.effective else {}
+        own = dict[str, int]()
+        if self.effective:  # as of `MCMC`
+            own = {"warmup": 2 * self.warmup, "patience": self.patience, "effective": self.effective}
         return replace(fallback, chains=self.chains, draws=self.draws, **own) if fallback.takes(prior) else None
 
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> CollapsedState:

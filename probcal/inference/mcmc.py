@@ -34,6 +34,7 @@ class MCMC(Sampler):
     name = "MCMC"
     priors = Collapsed.priors
     atoms = True
+    chooses = True
 
     def __post_init__(self):
         super().__post_init__()

@@ -114,6 +114,7 @@ class Method(ABC):
     intervals: ClassVar[str]  # what the intervals are worth
     work: ClassVar[type[MethodTask]]  # what it does on a problem, where `task` does not choose
     climbs: ClassVar[bool] = True  # to a mode; others start at the joint mode where noise levels are unknown
+    chooses: ClassVar[bool] = False  # whether another method, of its own choice, does the work
     engined: ClassVar[bool] = False  # whether it asks the engine that suits the size, and no other form
     roomy: ClassVar[bool] = True  # whether it takes a padded problem: not what draws all states together
 

@@ -40,6 +40,7 @@ class Named(Protocol):
     """What an answer says of a method."""
 
     name: ClassVar[str]
+    chooses: ClassVar[bool]
 
     def note(self, prior: Prior) -> str:
         """What the intervals are worth under a prior."""

@@ -69,6 +69,7 @@ class Watched:
     """What the tree says of the method."""
 
     name: ClassVar[str] = "online filter"
+    chooses: ClassVar[bool] = False
 
     def __init__(self, settings: Any):
         self.settings = settings

@@ -84,7 +84,7 @@ def pool_of(answer: Answer, key: jax.Array, problem: Problem) -> Pool:
         )
     points = Points(flat(drawn.z), flat(drawn.levels), states)
     hyper = {name: flat(a) for name, a in posterior.hyper.items()}
-    taken = answer.method != answer.requested
+    taken = answer.method != answer.requested and not answer.requested.chooses
     run, joint = posterior.run, posterior.joint
     status = TAKEN if taken else str(answer.status) if run is None else "sampled"
     if joint is None and run is not None and isinstance(run.posed, Posed):
