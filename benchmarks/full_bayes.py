@@ -77,7 +77,7 @@ def fits(name: str, method: Any, out: Path, limit: float | None) -> dict[str, xr
     """The fits of a case by EA as printed, EA and full Bayes; those that are kept are loaded."""
     problem, truth, prior = CASES[name]()
     found = dict[str, xr.DataTree]()
-    for label, own in EAS | {"full Bayes": method}:
+    for label, own in (EAS | {"full Bayes": method}).items():
         file = out / name / f"{label.replace(' ', '-')}.nc"
         if not file.exists():
             given = prior if prior is not None and own.takes(prior) else ARD() if label == "as printed" else None
@@ -96,9 +96,9 @@ def fits(name: str, method: Any, out: Path, limit: float | None) -> dict[str, xr
 def arrival(name: str, tree: xr.DataTree) -> str:
     """The line of a case: how long full Bayes took, and how well it mixed."""
     group, stats = tree["calibration"].to_dataset(), tree["sample_stats"].to_dataset()
-    worst = group["bias_label"].values[int(group["ess"].argmin())]
+    worst = group["bias_label"].values[int(group["ess"].values.argmin())]
     least = float(group["ess"].min())
-    size = f"{group.sizes['bias_label']}, {tree['observed_data'].sizes.get('row', 0)}"
+    size = f"{group.sizes['bias_label']}, {tree['observed_data'].sizes['datum']}"
     diverged = int(stats["diverging"].sum()) if "diverging" in stats else 0
     cells = (tree.attrs["method"], tree.attrs["status"], f"{least:.0f}", worst, f"{float(group['r_hat'].max()):.3f}")
     spent = f"{diverged} | {tree.attrs['wall']:.0f} | {tree.attrs['processor']:.0f}"
@@ -123,7 +123,7 @@ def agreement(name: str, label: str, ea: xr.DataTree, full: xr.DataTree) -> str:
     }
     cells = []
     for quantity, own in size.items():
-        worst = own["bias_label"].values[int(own.argmax())]
+        worst = own["bias_label"].values[int(own.values.argmax())]
         middle = own.median() if quantity != "sd" else off["sd"].median()
         cells.append(f"{float(middle):.2f}, {float(off[quantity].sel(bias_label=worst)):.2f} {worst}")
     held = ", ".join(f"{tree.attrs['coverage']:.2f}" for tree in (ea, full) if "coverage" in tree.attrs) or "–"

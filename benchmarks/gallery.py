@@ -40,7 +40,9 @@ HOW = {
 }  # fmt: skip
 HEAD = """# Notebooks and models
 
-Made by `benchmarks/gallery.py`. Notebooks run from top to bottom; a model is run by `probcal fit models/NAME.py`.
+Made by `benchmarks/gallery.py`. Notebooks run from top to bottom; a model is run by `probcal fit models/NAME.py`. Pages
+by task are in [guide](guide): [declare](guide/declare.md), [before a fit](guide/before.md),
+[results](guide/results.md), [methods](guide/methods.md).
 """
 
 
@@ -109,7 +111,7 @@ def main():
         parts.append(f"\n## {heading}\n")
         for title, link, text, picture in entries:
             shown = f"\n![{title}]({picture})\n" if (ROOT / "notebooks" / picture).exists() else ""
-            parts.append(f"\n### [{title}]({link})\n\n{text}\n{shown}")
+            parts.append(f"\n### {title}\n\n[{Path(link).name}]({link}): {text}\n{shown}")
     (ROOT / "notebooks" / "README.md").write_text("".join(parts))
 
 

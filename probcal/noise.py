@@ -797,7 +797,7 @@ class Mixture(AdditiveNoise):
         return jnp.logaddexp(*self._often(square, size)) + 0.5 * square
 
     def mixing_information(self, size):
-        """By the trapezoidal rule over |u|^2, for one size."""
+        """By the trapezoidal rule over the square of u, for one size."""
         most = int(np.max(size, initial=1))
         of = np.array([1.0, *(self._radial(n) for n in range(1, most + 1))])
         return of[np.asarray(size, int)]

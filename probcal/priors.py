@@ -235,7 +235,7 @@ class Gaussian(Prior):
 class Laplace(Prior):
     """Zero-mean Laplace density with the declared scale as its standard deviation: l1 (thesis 4.14b, lambda 2/beta).
 
-    Its mode is found as a Gaussian scale mixture: precision sqrt(2) / |z|, renewed at every iteration.
+    Its mode is found as a Gaussian scale mixture: precision sqrt(2) / abs(z), renewed at every iteration.
     """
 
     learns = True

@@ -1,4 +1,4 @@
-"""Verbs and methods by engine: how each is asked, and the sentence where it does not run; the table of the README.
+"""Verbs and methods by engine: how each is asked, and the sentence where it does not run; the table of the guide.
 
     uv run python tests/engines.py
 
@@ -18,7 +18,8 @@ from probcal.inference.methods import table as of_priors
 from probcal.modes import automatic_start
 from probcal.types import float64
 
-README, BEGIN, END = Path(__file__).parents[1] / "README.md", "<!-- engines -->\n", "<!-- /engines -->\n"
+GUIDE = Path(__file__).parents[1] / "notebooks" / "guide" / "large.md"
+BEGIN, END = "<!-- engines -->\n", "<!-- /engines -->\n"
 KINDS = {  # what an engine is called in the table: many has no matrix of all biases, whatever the library
     "dense": "dense", "cholmod": "cholmod, superlu", "superlu": "cholmod, superlu", "many": "above 600 biases",
     "iterative": "iterative",
@@ -122,9 +123,9 @@ def table():
 
 
 def main():
-    """Write the table into the README."""
-    before, _, rest = README.read_text().partition(BEGIN)
-    README.write_text(before + BEGIN + table() + END + rest.partition(END)[2])
+    """Write the table into the guide."""
+    before, _, rest = GUIDE.read_text().partition(BEGIN)
+    GUIDE.write_text(before + BEGIN + table() + END + rest.partition(END)[2])
 
 
 if __name__ == "__main__":

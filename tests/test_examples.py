@@ -1,7 +1,8 @@
-"""The examples in docstrings run; `problem`, `run` and `tree` in them are those of the README."""
+"""The examples in docstrings and in the guide run; `problem`, `run` and `tree` in them are those of the README."""
 
 import doctest
 import importlib
+import re
 from pathlib import Path
 
 import jax
@@ -14,6 +15,9 @@ from probcal.geometry import bearing, norm
 
 ROOT = Path(probcal.__file__).parent
 SHOWN = [path for path in sorted(ROOT.rglob("*.py")) if ">>>" in path.read_text()]
+PROJECT = Path(__file__).parents[1]
+GUIDE = sorted((PROJECT / "notebooks" / "guide").glob("*.md"))
+PAGES = [PROJECT / name for name in ("README.md", "CONTRIBUTING.md", "benchmarks/README.md", "notebooks/README.md")]
 
 
 @sensor(range=Channel("m", std=1.0), azimuth=Channel("rad", std=0.01, wrap=True))
@@ -63,3 +67,31 @@ def test_the_examples_of_a_module_run(path, names):
         found = doctest.testmod(module, extraglobs=names)
     assert found.attempted
     assert not found.failed
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("path", [path for path in GUIDE if ">>>" in path.read_text()], ids=lambda path: path.stem)
+def test_the_examples_of_the_guide_run(path, names):
+    with jax.enable_x64(True):
+        found = doctest.testfile(str(path), module_relative=False, globs=dict(names))
+    assert found.attempted
+    assert not found.failed
+
+
+@pytest.mark.parametrize("path", [*PAGES, *GUIDE], ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_links_lead_to_files_and_headings_that_exist(path):
+    for link in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
+        file, _, anchor = link.partition("#")
+        if "://" in file:
+            continue
+        there = (path.parent / file).resolve() if file else path
+        assert there.exists(), f"{path.name}: {link}"
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", there.read_text(), re.MULTILINE)
+            kept = {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+            assert anchor in kept, f"{path.name}: {link}"
+
+
+def test_every_page_of_the_guide_is_linked_from_the_readme():
+    text = (PROJECT / "README.md").read_text()
+    assert not [path.name for path in GUIDE if f"notebooks/guide/{path.name}" not in text]

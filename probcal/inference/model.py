@@ -116,18 +116,17 @@ def numpyro_model(problem: Problem, *, prior: AnyPrior = None) -> NumpyroModel:
 
     numpyro's own start is a track far from the data, from which kernels and guides may never find the posterior.
     `model.start()` gives values of all latent sites at the automatic start, `model.start(tree)` at a fit's result;
-    `model.dims` and `model.coords` label what is drawn:
+    `model.dims` and `model.coords` label what is drawn::
 
-    ```python
-    import arviz as az, jax
-    from numpyro.infer import MCMC, NUTS, init_to_value
+        import arviz as az, jax
+        from numpyro.infer import MCMC, NUTS, init_to_value
 
-    with jax.enable_x64(True):
-        model = numpyro_model(problem, prior=prior)
-        mcmc = MCMC(NUTS(model, init_strategy=init_to_value(values=model.start())), num_warmup=500, num_samples=500)
-        mcmc.run(jax.random.key(0))
-        tree = az.from_numpyro(mcmc, dims=model.dims, coords=model.coords)
-    ```
+        with jax.enable_x64(True):
+            model = numpyro_model(problem, prior=prior)
+            kernel = NUTS(model, init_strategy=init_to_value(values=model.start()))
+            mcmc = MCMC(kernel, num_warmup=500, num_samples=500)
+            mcmc.run(jax.random.key(0))
+            tree = az.from_numpyro(mcmc, dims=model.dims, coords=model.coords)
 
     and a guide is `AutoMultivariateNormal(model, init_loc_fn=init_to_value(values=model.start()), init_scale=0.01)`.
     The sites are not whitened by the data: with precise bearings and starts that are not declared numpyro's kernels
