@@ -17,6 +17,7 @@ ROOT = Path(probcal.__file__).parent
 SHOWN = [path for path in sorted(ROOT.rglob("*.py")) if ">>>" in path.read_text()]
 PROJECT = Path(__file__).parents[1]
 GUIDE = sorted((PROJECT / "notebooks" / "guide").glob("*.md"))
+EXTEND = sorted((PROJECT / "notebooks" / "extend").glob("*.md"))
 PAGES = [PROJECT / name for name in ("README.md", "CONTRIBUTING.md", "benchmarks/README.md", "notebooks/README.md")]
 
 
@@ -78,7 +79,7 @@ def test_the_examples_of_the_guide_run(path, names):
     assert not found.failed
 
 
-@pytest.mark.parametrize("path", [*PAGES, *GUIDE], ids=lambda path: f"{path.parent.name}/{path.stem}")
+@pytest.mark.parametrize("path", [*PAGES, *GUIDE, *EXTEND], ids=lambda path: f"{path.parent.name}/{path.stem}")
 def test_links_lead_to_files_and_headings_that_exist(path):
     for link in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
         file, _, anchor = link.partition("#")
@@ -92,6 +93,7 @@ def test_links_lead_to_files_and_headings_that_exist(path):
             assert anchor in kept, f"{path.name}: {link}"
 
 
-def test_every_page_of_the_guide_is_linked_from_the_readme():
-    text = (PROJECT / "README.md").read_text()
-    assert not [path.name for path in GUIDE if f"notebooks/guide/{path.name}" not in text]
+def test_every_page_is_linked_from_the_front():
+    readme, contributing = ((PROJECT / name).read_text() for name in ("README.md", "CONTRIBUTING.md"))
+    assert not [path.name for path in GUIDE if f"notebooks/guide/{path.name}" not in readme]
+    assert not [path.name for path in EXTEND if f"notebooks/extend/{path.name}" not in contributing]
