@@ -432,6 +432,10 @@ def test_the_recording_of_a_model_is_taken_where_none_is_given(model, rows):
             ["--method", "map", "--draws", "10"],
             '--draws: "map" draws no chains; take mcmc, collapsed, nuts, gibbs or svi',
         ),
+        (
+            ["--method", "svi", "--effective", "10"],
+            '--effective is not for the method "svi"; leave it out, or take mcmc',
+        ),
     ],
 )
 def test_options_of_samplers_are_checked(options, text, model, rows):

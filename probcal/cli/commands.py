@@ -81,6 +81,7 @@ def fit_command(
     chains: Annotated[int | None, options.count(1, "chains of a sampler")] = None,
     draws: Annotated[int | None, options.count(1, "draws of each chain after warm-up")] = None,
     warmup: Annotated[int | None, options.count(0, "steps of each chain before its draws")] = None,
+    effective: Annotated[int | None, options.count(1, "effective draws at which mcmc ends")] = None,
     resume: Annotated[
         bool,
         typer.Option(
@@ -118,7 +119,8 @@ def fit_command(
     wings.check_method_installed(method)
     check_known(method, METHODS, f'--method "{method}" is not known')
     options.check_priors(method, prior or ())
-    sizes = options.chain_sizes(method, {"chains": chains, "draws": draws, "warmup": warmup})
+    numbers = {"chains": chains, "draws": draws, "warmup": warmup, "effective": effective}
+    sizes = options.chain_sizes(method, numbers)
     if resume and out is None:
         raise InputError("--resume needs --out, the folder of the run to go on with")
     recordings = options.recordings(data or (), out, scheduler)

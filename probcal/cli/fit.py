@@ -94,6 +94,9 @@ def calibrated(
     """
     known, implied = METHODS[method]
     value: Any = known
+    for option in sizes:
+        if option not in value.__dataclass_fields__:
+            raise InputError(f'--{option} is not for the method "{method}"; leave it out, or take mcmc')
     value = replace(value, **sizes) if sizes else value
     began, monitor = time.perf_counter(), Monitor(limit=limit, signals=()) if monitor is None else monitor
     monitor.enter("start", value.name)

@@ -6,8 +6,8 @@ u_k = -K_k x_{k-1} + C_k eps_k, the factor of the posterior that a backward info
 (the control form of the Kalman smoother). Where a process noise is unknown the pass is made at some
 values of each level, and interpolated: a track that the data hardly hold widens with its process
 noise, one that they hold does not, and neither leaves a funnel. theta is the biases z and the log
-levels. With the trajectories marginalised the data have a Gaussian log-likelihood of theta. Both are
-exact where the problem is linear and Gaussian and no level is unknown; elsewhere `log_weight` says
+levels. With the trajectories marginalised the data have a Gaussian log-likelihood of theta. Both
+are exact where the problem is linear and Gaussian and no level is unknown; elsewhere `log_weight` says
 by how much they are wrong at a point.
 """
 
@@ -38,11 +38,11 @@ from probcal.model.rows import LinearRows
 from probcal.model.trajectories import States
 
 STEP = 0.05  # of a log level, for differences
-FARTHEST, APART = 6, 0.5  # closed loops that are known on either side of a log level, and from one to the next
+LEVELS = np.linspace(-3.5, 3.5, 15)  # steps of a log level at which closed loops are known
 
 
 class Closed(NamedTuple):
-    """A closed loop u = shift - feedback x + factor exp(size) eps, its noises u at the levels of the frame's point."""
+    """A closed loop u = shift - feedback x + factor exp(size) eps, u at the levels of the point."""
 
     feedback: jax.Array  # (E, n, n) K
     factor: jax.Array  # (E, n, n) C with columns of unit diagonal
@@ -51,13 +51,13 @@ class Closed(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """Trajectories of one recursion given theta: response to the biases, and the closed loop of the rest."""
+    """Trajectories of one recursion given theta: response to the biases, and the closed loop."""
 
     states: jax.Array  # (E, n, M) response of the states to the biases
     noises: jax.Array  # (E, n, M) response of the whitened noises
     closed: Closed  # at the levels of the point
-    by_level: Closed  # at one level moved by each of `LEVELS` (H, L, E, ...); none where the process noise is known:
-    # data tell their own noise so well that one loop serves
+    by_level: Closed  # at one level moved by each of `LEVELS` (H, L, E, ...); none where the process
+    # noise is known: data tell their own noise so well that one loop serves
 
 
 class Frame(NamedTuple):
@@ -140,7 +140,7 @@ def averaged(model: Model, frame: Frame, theta: jax.Array, eps: States) -> Linea
 
 
 def _at(model: Model, point: Point, levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Marginal log-likelihood (D,) and its slope by z (D, M) at levels (D, H), trajectories at their mode."""
+    """Marginal log-likelihood (D,) and slope by z (D, M) at levels (D, H), tracks at their mode."""
 
     def one(levels: np.ndarray) -> tuple[Any, Any]:
         moved = smooth_tracks(model, at_levels(model, point, jax.device_put(levels)))
@@ -157,7 +157,7 @@ def frame_at(model: Model, point: Point) -> Frame:
 
 
 def refined(model: Model, frame: Frame, theta: jax.Array, eps: States) -> Frame:
-    """The frame with trajectories and curvature fitted to draws theta (D, Q), eps (D, E, n) of it (see `averaged`)."""
+    """The frame with tracks and curvature fitted to draws theta (D, Q), eps (D, E, n) of it."""
     solved = eliminate_rows(model, frame.point, averaged(model, frame, theta, eps))
     point = follow(model, frame.point, solved.parts, jnp.zeros_like(frame.point.z), free=True)
     return _frame(model, point, averaged(model, frame._replace(point=point), theta, eps))
@@ -191,11 +191,8 @@ def _framed(model: Model, point: Point, lins: LinearRows, solved: Eliminated, va
     return Frame(point, information, score, height, tuple(loops))
 
 
-LEVELS = APART * np.arange(-FARTHEST - 1, FARTHEST + 2)  # two more, for the slopes of the interpolation at the ends
-
-
 def _at_levels(part: Recursion, levels: jax.Array, J: jax.Array, score: jax.Array, shares: Any, u: jax.Array) -> Closed:
-    """The loops of one recursion where one level is moved, of shares (H, E, ...) of J and score that have its noise."""
+    """The loops of one recursion where a level is moved; `shares` of J and score have its noise."""
     H = 0 if shares is None else levels.shape[0]
 
     def at(step: jax.Array) -> Closed:
@@ -245,12 +242,13 @@ def _with_levels(
 
 
 def _closed(model: Model, frame: Frame, theta: jax.Array) -> list[Closed]:
-    """The closed loops of all recursions at the levels of theta (Q,), cubic between those that are known."""
+    """The closed loops of all recursions at the levels of theta (Q,), cubic between known ones."""
     step = theta[frame.point.z.shape[0] :] - frame.point.levels
     if frame.loops[0].by_level.size.shape[0] == 0:
         return [loop.closed for loop in frame.loops]
-    place = jnp.clip((step - LEVELS[0]) / APART, 1, 2 * FARTHEST + 1)
-    first = jnp.minimum(place.astype(int), 2 * FARTHEST) - 1
+    last = len(LEVELS) - 2
+    place = jnp.clip((step - LEVELS[0]) / (LEVELS[1] - LEVELS[0]), 1, last)
+    first = jnp.minimum(place.astype(int), last - 1) - 1
     t = place - first - 1
     cubic = jnp.array([[0.0, -0.5, 1.0, -0.5], [1.0, 0.0, -2.5, 1.5], [0.0, 0.5, 2.0, -1.5], [0.0, 0.0, -0.5, 0.5]])
     weight = jnp.stack([t**0, t, t**2, t**3], 1) @ cubic.T  # (H, 4), by Catmull and Rom
@@ -259,7 +257,7 @@ def _closed(model: Model, frame: Frame, theta: jax.Array) -> list[Closed]:
         def at(leaf: jax.Array) -> jax.Array:
             near = [jax.lax.dynamic_slice_in_dim(own, k, 4) for own, k in zip(leaf, first, strict=True)]
             moved = sum(jnp.tensordot(w, own, 1) for w, own in zip(weight, near, strict=True))
-            return moved - (len(near) - 1) * leaf[0, FARTHEST + 1]
+            return moved - (len(near) - 1) * leaf[0, len(LEVELS) // 2]
 
         own = Closed(*map(at, loop.by_level))
         wider = _wider(part, step)
@@ -327,7 +325,7 @@ def _volume(model: Model, frame: Frame, theta: jax.Array, loops: list[Closed]) -
 
 
 def log_joint(model: Model, frame: Frame, theta: jax.Array, eps: States) -> jax.Array:
-    """Log density of data and eps given theta, less that of independent unit normals' constant; -inf if not finite."""
+    """Log density of data and eps given theta, up to the constant of eps; -inf if not finite."""
     loops = _closed(model, frame, theta)
     point = _placed(model, frame, theta, eps, loops)
     value = mixed_density(model, point) + _volume(model, frame, theta, loops)

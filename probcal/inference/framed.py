@@ -13,14 +13,12 @@ import numpy as np
 
 from probcal.inference.chains import Draw, run_chunk, run_sided, run_together
 from probcal.inference.orbits import orbits_of
-from probcal.inference.pose import chain_start, pose
+from probcal.inference.pose import GOOD, chain_start, pose
 from probcal.inference.sampler import Sampler
 from probcal.inference.sampling import Chains, each_chain
 from probcal.inference.sides import Sided, distances, side_by_side
 from probcal.modes.explore import Mirrored, new, reach
 from probcal.modes.mirrors import other_sides
-
-ROAMING = 0.9  # acceptance of leaps below which chains also move along orbits
 
 
 @dataclass(eq=False)
@@ -55,7 +53,7 @@ class FramedChains(Chains):
         if len(poses) > 1:
             away = distances(problem, [start, *(other.point for other in sides)])
             poses = [(one._replace(away=own), drawn) for (one, drawn), own in zip(poses, away, strict=True)]
-        if worth.acceptance < ROAMING and self.method.roams and not self.form.hierarchy.spiked:
+        if worth.acceptance < GOOD and self.method.roams and not self.form.hierarchy.spiked:
             covariance = np.cov(np.asarray(found.theta)[:, : self.biases].T).reshape(self.biases, self.biases)
             orbits = orbits_of(problem, posed, covariance)
             poses = [(one._replace(orbits=orbits), drawn) for one, drawn in poses]

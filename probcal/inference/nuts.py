@@ -25,15 +25,14 @@ if TYPE_CHECKING:
 else:
     hmc = Later("numpyro.infer.hmc")
 
-WARMING = 7  # doublings of a tree at most while step size and metric adapt
-
 
 @dataclass(frozen=True)
 class NUTS(FramedSampler):
     """Exact posterior of biases, hyper-parameters and trajectories by the no-U-turn sampler (Hoffman, Gelman 2014).
 
-    `chains` of `warmup` and `draws` steps, a diagonal metric (`dense=True`: full), steps that are accepted with
-    probability `target`, trees of at most `depth` doublings. Raises `InputError` for settings outside their ranges.
+    `chains` of `warmup` and `draws` steps, a diagonal metric (`dense=True`: full), steps that are
+    accepted with probability `target`, trees of at most `depth` doublings, three less while it warms
+    up. Raises `InputError` for settings outside their ranges.
     """
 
     chains: int = 4
@@ -65,7 +64,7 @@ class NUTS(FramedSampler):
     def _started(self, kernels: tuple[Any, Any], free: Free, key: jax.Array) -> Any:
         return kernels[0](
             free, self.warmup, step_size=0.3, dense_mass=self.dense, target_accept_prob=self.target,
-            max_tree_depth=(min(self.depth, WARMING), self.depth), rng_key=key,
+            max_tree_depth=(max(self.depth - 3, 1), self.depth), rng_key=key,
         )  # fmt: skip
 
     def kernel(self) -> NUTS:

@@ -22,14 +22,13 @@ from probcal.problem import Problem
 
 PILOTS = 4  # chains of the pilot
 BURN, KEPT, STRIDE = 100, 100, 4  # sweeps before, draws kept of each pilot, sweeps between two
-MOVES = 1  # of a frame; further ones made few frames better, and some worse
 FITS, GOOD = 0.5, 0.9  # Pareto k-hat and acceptance of a new theta at which a frame is left alone
 SCARCE = 0.1  # acceptance below which it has failed: leaps are rare
 ROUNDS = 4  # trajectories at which that acceptance is judged, each by as small a part of the draws
 TAILED = 25  # draws below which a Pareto tail cannot be fitted
 FITTINGS, FITTED = 2, 20  # rounds and draws (with mirror images) that a frame is fitted to
 SPREAD = 1.5  # by how much chains start further out than the pilot's draws
-NEAR, DRAWN_IN = 8, (1.0, 0.3, 0.1, 0.03, 0.01)  # draws, and the shares by which those of a bad frame are drawn in
+DRAWN_IN = 0.3  # factor by which draws of a bad frame are drawn in, again and again
 
 
 class Pilot(NamedTuple):
@@ -149,7 +148,7 @@ def pose(
     form = Form(model.biases, hierarchy_of(prior, problem))
     posed = Posed(model, frame_at(model, start), problem.first_precision(prior))
     best = None
-    for move in range(MOVES + 1):
+    for move in range(2):  # further moves made few frames better, and some worse
         keys = jax.random.split(jax.random.fold_in(key, move), 3)
         found = pilot(form, posed, keys[0])
         logs = np.asarray(weights(posed, found.theta, jax.random.split(keys[1], len(found.theta))))
@@ -165,25 +164,26 @@ def pose(
             break
         posed = posed._replace(frame=frame)
     assert best is not None
-    posed, found, worth = best
-    if worth.failed:
-        posed, found = _nearby(form, posed, key)
-    return form, posed, found, worth
+    if best[2].failed:
+        best = *_nearby(form, best[0], key), best[2]
+    return form, *best
 
 
-def _nearby(form: Form, posed: Posed, key: jax.Array) -> tuple[Posed, Pilot]:
+def _nearby(form: Form, bad: Posed, key: jax.Array) -> tuple[Posed, Pilot]:
     """A frame that does not fit, as if each entry of theta were also measured with sd 1, and draws
-    of its pilot, drawn in towards its point until the joint density nearly follows them."""
-    frame = posed.frame
-    posed = posed._replace(frame=frame._replace(information=frame.information + jnp.eye(len(frame.theta))))
-    found, at = pilot(form, posed, key), frame.theta
-    some = found.theta[:: len(found.theta) // NEAR]
-    keys = jnp.broadcast_to(key, (len(some) + 1, *key.shape))
-    for share in DRAWN_IN:
-        here, *there = np.asarray(weights(posed, jnp.concatenate([at[None], at + share * (some - at)]), keys))
-        if np.median(there) > here - len(at):
+    of it, drawn in towards its point until the joint density nearly follows them."""
+    frame, share = bad.frame, 1.0
+    near = bad._replace(frame=frame._replace(information=frame.information + jnp.eye(len(frame.theta))))
+    found = pilot(form, near, key)
+    away = (found.theta - frame.theta)[:: len(found.theta) // FITTED]
+    keys = jnp.broadcast_to(key, (len(away) + 1, *key.shape))
+    for power in range(5):
+        share = DRAWN_IN**power
+        theta = frame.theta + share * jnp.concatenate([jnp.zeros_like(away[:1]), away])
+        here, *there = np.asarray(weights(near, theta, keys))
+        if np.median(there) > here - len(frame.theta):
             break
-    return posed, found._replace(theta=at + share * (found.theta - at))
+    return near, found._replace(theta=frame.theta + share * (found.theta - frame.theta))
 
 
 def chain_start(form: Form, posed: Posed, found: Pilot, k: int, chains: int) -> tuple[jax.Array, Phi]:
