@@ -239,6 +239,7 @@ MUTATIONS = [
     Mutation(" - 0.5 * np.log(2 * np.pi) * normal", "", "test_svi.py"),
     Mutation("np.clip(steps - method.warmup, 0", "np.clip(steps, 0", "test_mixing.py"),
     Mutation("self.draws[::-2][::-1]", "self.draws[::2]", "test_mixing.py"),
+    Mutation("and not answer.requested.chooses", "", "test_sbc.py"),
     Mutation("0.99 ** (1.0 / len(ess))", "0.99", "test_mixing.py"),
     Mutation("wanted or min(ESS", "min(ESS", "test_mixing.py"),
     Mutation('self.found = numbered(part, "state"), chunks', 'self.found = numbered(part, "state"), chunks[:-1]', "test_storage.py"),

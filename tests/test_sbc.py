@@ -25,6 +25,7 @@ from probcal import (
     ARD,
     EA,
     MAP,
+    MCMC,
     Bias,
     Channel,
     ConstantVelocity,
@@ -506,6 +507,13 @@ def test_short_samplers():
     assert short(NUTS()) == NUTS(chains=2, warmup=150, draws=150)
     assert short(Collapsed(chains=1, warmup=20)) == Collapsed(chains=1, warmup=20, draws=150)
     assert short(EA()) == EA()
+    assert short(MCMC()) == MCMC(chains=2, draws=150, effective=150)
+
+
+@pytest.mark.ci
+def test_the_sampler_that_mcmc_chooses_counts_as_its_own():
+    tree = quick(MCMC(chains=2, warmup=20, draws=60, effective=20), HORSESHOE, runs=2)
+    assert set(tree["run"]["status"].values.tolist()) == {"sampled"}
 
 
 # pictures and command line

@@ -147,6 +147,8 @@ def short(method: Method) -> Method:
     if not isinstance(method, Sampler):
         return method
     least = {name: min(getattr(method, name), most) for name, most in SHORT.items()}
+    if method.effective:
+        least["effective"] = min(method.effective, least["chains"] * least["draws"] // 2)
     changed: Any = method
     return replace(changed, **least)
 
