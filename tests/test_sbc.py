@@ -7,7 +7,7 @@ runs 500 simulations of a small radar network, the default suite 40. The statist
 import importlib
 import os
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -48,6 +48,7 @@ from probcal import (
     simulate,
 )
 from probcal.cli.models import load_model
+from probcal.geometry import norm
 from probcal.inference.chains import Sample
 from probcal.inference.collapsed import Collapsed
 from probcal.inference.gibbs import reversible_sweeps
@@ -332,6 +333,29 @@ def test_nuts_is_uniform():
     tree = quick(NUTS(chains=1, warmup=80, draws=100), Gaussian(), problem=cameras())
     assert tree.attrs["status"] == "uniform", tree.attrs["verdict"]
     assert {level.label for level in cameras().levels} <= set(tree["sbc"]["quantity"].values)
+
+
+@sensor(range=Channel("m", std=0.5))
+def ranger(target, pose, *, range_offset=Bias("m", 2.0)):
+    """A range, on which side of its line of nodes nobody knows."""
+    return {"range": norm(target.position - pose.position) + range_offset}
+
+
+@cache
+def line():
+    """Three rangers on a line, and a target whose start says nothing of the side: two modes."""
+    network = Network([ranger.on(Node(f"n{k}", (20.0 * k, 0.0))) for k in range(3)])
+    start = {"position": ((10.0, 0.0), 15.0), "velocity": ((1.0, 0.0), 0.7)}
+    return simulated(network, 15, Target(ConstantVelocity(0.3), start))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("problem", "runs", "key"), [(partial(radars, 4, 15), 200, 1), (line, 150, 0)])
+def test_mcmc_is_uniform(problem, runs, key):
+    """One mode and two, no start given; a right sampler fails with probability 1 %."""
+    method = MCMC(chains=2, effective=200)
+    tree = sbc(problem(), method, prior=HORSESHOE, runs=runs, threads=2, key=key)
+    assert tree.attrs["status"] == "uniform", tree.attrs["verdict"]
 
 
 @pytest.mark.slow
