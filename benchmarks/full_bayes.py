@@ -29,7 +29,7 @@ from probcal.priors import ARD
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 
-DATA = Path(__file__).parents[2] / "shared" / "data"
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 EAS = {"as printed": pc.EA.as_printed(), "integrated": pc.EA()}
 COLOURS = {"as printed": "#d95f02", "integrated": "#1b6ca8"}
 Made = tuple[pc.Problem, Any, Any]  # problem, truth or None, prior or None
