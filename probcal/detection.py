@@ -33,7 +33,7 @@ class Sector:
             raise InputError(f"{self}: range is positive in m, width in rad up to 2 pi, towards a finite angle")
 
     def __call__(self, target: TargetView, pose: PoseView) -> jax.Array:
-        """Whether a target is seen, 1 or 0."""
+        """1 if a target is seen, else 0."""
         line = pose.local(target.position)
         near = norm(line) <= self.range
         return (near & (jnp.abs(wrap(bearing(line) - self.towards)) <= 0.5 * self.width)).astype(float)

@@ -60,7 +60,7 @@ def maps() -> int:
 
 
 def limit() -> int:
-    """How many memory maps a process may have; the usual 65530 where the system does not say."""
+    """The number of memory maps a process may have; the usual 65530 where the system does not say."""
     try:
         return int(LIMIT.read_text())
     except (OSError, ValueError):

@@ -87,7 +87,7 @@ class Column:
 
     @cached_property
     def marked(self) -> np.ndarray:
-        """Whether each value is one of the sentinels."""
+        """True if each value is one of the sentinels."""
         raw = np.asarray(self.raw(self.value))
         return np.isclose(raw[:, None], SENTINELS, rtol=1e-12, atol=0.0).any(1)
 

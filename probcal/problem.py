@@ -459,7 +459,7 @@ class Problem:
 
     @property
     def tilted(self) -> bool:
-        """Whether there is such a term."""
+        """True if there is such a term."""
         return self.model.tilt is not None and any(np.any(leaf) for leaf in self.model.tilt)
 
     @property

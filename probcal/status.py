@@ -23,22 +23,22 @@ class Status(StrEnum):
 
     @property
     def valid(self) -> bool:
-        """Whether the numbers are estimates at all."""
+        """True if the numbers are estimates at all."""
         return self not in (Status.AT_BOUND, Status.DIVERGED, Status.GAUGE, Status.MISFIT)
 
     @property
     def settled(self) -> bool:
-        """Whether the method ended as it was asked to: it converged, or was to run so many iterations and did."""
+        """True if the method ended as it was asked to: it converged, or was to run so many iterations and did."""
         return self in (Status.CONVERGED, Status.SPENT)
 
     @property
     def explains(self) -> bool:
-        """Whether the model explains the data at all."""
+        """True if the model explains the data at all."""
         return self is not Status.MISFIT
 
     @property
     def again(self) -> bool:
-        """Whether a run with other random numbers may end otherwise."""
+        """True if a run with other random numbers may end otherwise."""
         return self in (Status.NOT_CONVERGED, Status.MISFIT)
 
 

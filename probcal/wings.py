@@ -60,7 +60,7 @@ class WingMissing(InputError, ImportError):
 
 
 def installed(module: str) -> bool:
-    """Whether the wing of a module is installed; the core is."""
+    """True if the wing of a module is installed; the core is."""
     wing = module.split(".")[1] if "." in module else ""
     return wing not in WINGS or (Path(__file__).parent / wing / "__init__.py").is_file()
 

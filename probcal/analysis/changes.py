@@ -197,7 +197,7 @@ def _alike(both: pieces.Pieces, moved: int, free: dict[int, pieces.Contrast], in
 
 
 def _contradictions(tree: xr.DataTree) -> str:
-    """How many biases of a fit drift or are in conflict, where its assessment was kept; empty where none."""
+    """The number of biases of a fit that drift or are in conflict; empty where no assessment was kept."""
     words = listed_in(tree, "verdict", "verdict")
     counts = {word: words.count(word) for word in ("drifting", "conflicting")}
     return ", ".join(f"{count} {word}" for word, count in counts.items() if count)

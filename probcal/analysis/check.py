@@ -99,7 +99,7 @@ class Case:
 
     @cached_property
     def rejected(self) -> Rejection:
-        """Whether the innovations reject the model, and what they call for."""
+        """The verdict of the innovations on the model, and the inflation that they call for."""
         return rejection(self.fit, self.innovations, self.channels)
 
     @cached_property

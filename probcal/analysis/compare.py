@@ -108,7 +108,7 @@ def fits_by_name(fits: Fits, names: Sequence[str] | None = None) -> dict[str, xr
 
 
 def plugged_in(tree: xr.DataTree) -> bool:
-    """Whether the posterior of the biases is one Gaussian, precisions and levels taken as known."""
+    """True if the posterior of the biases is one Gaussian, precisions and levels taken as known."""
     return bool(tree.attrs["approximate"] == "Laplace")
 
 

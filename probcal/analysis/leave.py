@@ -132,12 +132,12 @@ def psis(tree: xr.DataTree, group: np.ndarray, count: int, efficiency: float = 1
 
 
 def tailed(tree: xr.DataTree) -> bool:
-    """Whether a tree has a log-likelihood of every datum, of draws enough for a Pareto tail, and is no misfit."""
+    """True if a tree has a log-likelihood of every datum, of draws enough for a Pareto tail, and is no misfit."""
     return "log_likelihood" in tree.children and weighable(tree)
 
 
 def weighable(tree: xr.DataTree) -> bool:
-    """Whether a tree has the log-likelihood of draws enough for a Pareto tail, and is no misfit."""
+    """True if a tree has the log-likelihood of draws enough for a Pareto tail, and is no misfit."""
     summed = summed_log_likelihood(tree)
     return summed is not None and tree.attrs["status"] != "misfit" and summed.size >= TAILED
 

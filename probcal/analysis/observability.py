@@ -146,7 +146,7 @@ def _spectrum(information: np.ndarray) -> xr.Dataset:
 
 
 def _leverage_groups(problem: Problem, parts: Sequence[Any], share: np.ndarray) -> dict[str, xr.Dataset]:
-    """How many biases each datum (N, C), sensor and target determines; the motion tells the rest."""
+    """The number of biases that each datum (N, C), sensor and target determines; the motion tells the rest."""
     datum, picks = datum_of(problem)
     values = gather([np.asarray(part) for part in parts], picks)
     each = xr.Dataset({"leverage": ("datum", values)}, coords=datum["coords"])

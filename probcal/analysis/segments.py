@@ -249,7 +249,7 @@ def changed(problem: Problem, m: int, estimate: float, sd: float, limit: float) 
 
 
 def _shape(shape: Contrast | None, edges: np.ndarray, size: float) -> str:
-    """Whether quarters tell of a jump, and where, or of a drift, and how to declare that."""
+    """A jump between quarters, with its place, or a drift, and the declaration of it."""
     if shape is None:
         return ""
     later = np.arange(1, len(edges))

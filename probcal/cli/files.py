@@ -19,7 +19,7 @@ def write_csv(frame: "pd.DataFrame", path: Path) -> None:
 
 
 def can_plot() -> bool:
-    """Whether the plot packages, an extra, are there."""
+    """True if the plot packages, an extra, are there."""
     return all(importlib.util.find_spec(name) is not None for name in ("bokeh", "jinja2", "matplotlib"))
 
 

@@ -90,7 +90,7 @@ def network_file(path: Path | None) -> Path | None:
 
 
 def exists(path: Path) -> bool:
-    """Whether a file or folder is there; a name that no file can have is not."""
+    """True if a file or folder is there; a name that no file can have is not."""
     try:
         return path.exists()
     except (OSError, ValueError):

@@ -87,12 +87,12 @@ def choose_fast(model: Model) -> Engine:
 
 
 def prefers_sparse(model: Model) -> bool:
-    """Whether the matrices of the dense form take more than 240 MB."""
+    """True if the matrices of the dense form take more than 240 MB."""
     return dense_numbers(model) > ROOM
 
 
 def is_thin(model: Model) -> bool:
-    """Whether an epoch sees few of many biases: more than 500, less than a quarter of them."""
+    """True if an epoch sees few of many biases: more than 500, less than a quarter of them."""
     if model.biases <= MANY:
         return False
     seen = sum(int(np.sum(np.asarray(data.bias)[np.asarray(data.sensor)] < model.biases)) for data in model.rows)

@@ -119,7 +119,7 @@ class Climbed(NamedTuple):
 
     @property
     def converged(self) -> bool:
-        """Whether a step promised less than the tolerance."""
+        """True if a step promised less than the tolerance."""
         return bool(self.search.converged)
 
 

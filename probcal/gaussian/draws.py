@@ -33,12 +33,12 @@ class JointDraws(NamedTuple):
 
 
 def many_data(model: Model) -> bool:
-    """Whether data are too many for a value of each and of each draw to be kept."""
+    """True if data are too many for a value of each and of each draw to be kept."""
     return sum(int(np.asarray(mask).sum()) for mask in model.measured) > LARGE
 
 
 def draws_a_chain(data: int, chains: int) -> int:
-    """How many draws each chain of an approximation has: fewer where the data are many, with no step on the way."""
+    """The number of draws per chain of an approximation: fewer where the data are many, without a jump."""
     return int(np.clip(DATA // max(chains * data, 1), LEAST, MOST))
 
 

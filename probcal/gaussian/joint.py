@@ -133,7 +133,7 @@ class JointPrecision:
         return self._wider[0]
 
     def holds(self, members: np.ndarray) -> bool:
-        """Whether all pairs of biases (B, p) of a row have a place."""
+        """True if all pairs of biases (B, p) of a row have a place."""
         there = members < self.places.size - self.states
         return bool((self.pairs(members) >= 0)[outer(there)].all())
 

@@ -8,7 +8,7 @@ MOST = 5  # times that room up to which it is tried where there is no other
 
 
 def dense_numbers(model: Model) -> int:
-    """How many numbers the dense form holds: the response of every state to every bias, and three matrices (M, M)."""
+    """The size of the dense form: the response of every state to every bias, and three matrices (M, M)."""
     return model.biases * model.state_size + 3 * model.biases**2
 
 

@@ -17,7 +17,7 @@ PARALLEL: bool | None = None  # None: wherever the backend is no CPU; read where
 
 
 def in_parallel() -> bool:
-    """Whether epochs are scanned in parallel."""
+    """True if epochs are scanned in parallel."""
     return jax.default_backend() != "cpu" if PARALLEL is None else PARALLEL
 
 

@@ -105,7 +105,7 @@ def unfixed(problem: Problem, point: Point, vectors: np.ndarray) -> np.ndarray:
 
 
 def _countable(problem: Problem, ranks: Sequence[jax.Array]) -> bool:
-    """Whether at least half of the data stand in epochs with more data than unknowns."""
+    """True if at least half of the data stand in epochs with more data than unknowns."""
     inside = total = 0.0
     counts = variants.counts(problem.model, lambda mask: mask.sum(1))
     for count, rank in zip(counts, ranks, strict=True):

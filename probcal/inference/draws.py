@@ -25,7 +25,7 @@ def normals(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 
 
 def accepted(key: jax.Array, gain: jax.Array) -> jax.Array:
-    """Whether proposals whose log densities gain so much are taken (Metropolis)."""
+    """True if proposals whose log densities gain so much are taken (Metropolis)."""
     return jnp.log(jax.random.uniform(key)) < jnp.where(jnp.isfinite(gain), gain, -jnp.inf)
 
 

@@ -195,7 +195,7 @@ class EA(Maximiser):
         return kept, course if kept is state else course.and_then(single_course(kept))
 
     def _tries_again(self, prior: Prior) -> TypeGuard[ARD]:
-        """Whether maximised precisions are tried anew after a climb."""
+        """True if maximised precisions are tried anew after a climb."""
         return self.trajectory == "marginal" and isinstance(prior, ARD) and not self.integrates(prior)
 
     def climbs_once(self, problem: Problem, prior: Prior) -> bool:
@@ -230,7 +230,7 @@ class EA(Maximiser):
         return best_precisions(information, np.asarray(known.pull), np.asarray(state.alpha), learnt, sets)
 
     def integrates(self, prior: Prior) -> bool:
-        """Whether the precisions of a prior are integrated: a flat hyper-prior leaves no posterior."""
+        """True if the precisions of a prior are integrated: a flat hyper-prior leaves no posterior."""
         return self.precisions == "integrated" and not (isinstance(prior, ARD) and prior.rate == 0.0)
 
     def climbs_under(self, prior: Prior) -> Prior:

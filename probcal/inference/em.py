@@ -189,7 +189,7 @@ class EM(Maximiser):
 
     @property
     def by_particles(self) -> bool:
-        """Whether trajectories are particles."""
+        """True if trajectories are particles."""
         return isinstance(self.e_step, ParticleSmoother)
 
     def note(self, prior: Prior) -> str:

@@ -76,7 +76,7 @@ class Judged:
 
     @property
     def whole(self) -> bool:
-        """Whether the covariance of all biases is held."""
+        """True if the covariance of all biases is held."""
         return self.spread.whole
 
     @property
@@ -175,7 +175,7 @@ def take_up(problem: Problem, fit: xr.DataTree) -> Judged:
 
 
 def on_several_sides(fit: xr.DataTree) -> bool:
-    """Whether the draws of a tree lie on several sides of a mirror."""
+    """True if the draws of a tree lie on several sides of a mirror."""
     stats = fit["sample_stats"].to_dataset() if "sample_stats" in fit.children else {}
     return "side" in stats and bool(np.ptp(stats["side"].values))
 

@@ -294,7 +294,7 @@ class Gibbs(Sampler):
     )
 
     def keeps_states(self, model: Model) -> bool:
-        """Whether draws of all states are few enough to be kept."""
+        """True if draws of all states are few enough to be kept."""
         return self.chains * self.draws * model.state_size <= NUMBERS
 
     def check_kept(self, problem: Problem, keep: tuple[str, ...]) -> None:

@@ -71,7 +71,7 @@ def store_mark(path: Path) -> str:
 
 
 def holds_parts(path: Path) -> bool:
-    """Whether a folder holds parts of a run."""
+    """True if a folder holds parts of a run."""
     return bool(parts_of(path) or store_mark(path))
 
 

@@ -120,7 +120,7 @@ class Method(ABC):
 
     @property
     def by_particles(self) -> bool:
-        """Whether trajectories are particles, so that any motion will do and no start is needed."""
+        """True if trajectories are particles, so that any motion will do and no start is needed."""
         return False
 
     def task(self, problem: Problem, prior: Prior, start: Point, context: Context) -> MethodTask:
@@ -142,7 +142,7 @@ class Method(ABC):
         return self.priors[0]()
 
     def takes(self, prior: Prior) -> bool:
-        """Whether the method can be used with a prior."""
+        """True if the method can be used with a prior."""
         return isinstance(prior, self.priors)
 
     def note(self, prior: Prior) -> str:

@@ -1,4 +1,4 @@
-"""Whether chains have mixed: rank-normalised r_hat, effective draws, and the weights of the sides of a mirror."""
+"""Mixing of chains: rank-normalised r_hat, effective draws, and the weights of the modes of a mirror."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def mixing(draws: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _both_tails(draws: np.ndarray) -> bool:
-    """Whether some, but not all, draws lie beyond each of the quantiles that a tail ess looks at."""
+    """True if some, but not all, draws lie beyond each of the quantiles that a tail ess looks at."""
     return all(0 < (draws <= q).mean() < 1 for q in np.quantile(draws, (0.05, 0.95)))
 
 
@@ -72,7 +72,7 @@ class Effective(NamedTuple):
 
 
 def effective_draws(draws: Draw, count: int, wanted: int = 0) -> Effective:
-    """Whether draws on so many sides of a mirror have mixed as well as so many can show.
+    """True if draws on so many sides of a mirror have mixed as well as so many can show.
 
     Of biases and levels; where so many effective draws are `wanted`, of hyper-parameters too.
     """

@@ -48,12 +48,12 @@ class Worth(NamedTuple):
 
     @property
     def failed(self) -> bool:
-        """Whether leaps on the frame would hardly ever be taken."""
+        """True if leaps on the frame would hardly ever be taken."""
         return self.acceptance < SCARCE
 
     @property
     def good(self) -> bool:
-        """Whether the frame may be left where it is."""
+        """True if the frame may be left where it is."""
         return self.khat < FITS and self.acceptance > GOOD
 
     def order(self, *, whole: bool) -> tuple[float, float]:

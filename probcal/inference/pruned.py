@@ -51,7 +51,7 @@ class GroupEvidence:
         return float((fall - 0.5 * np.sum(np.log(alpha / own))) / max(promised, 1e-300))
 
     def stays(self, prior: ARD, share: float) -> bool:
-        """Whether some precision short of the upper bound is best for a group of so much less score."""
+        """True if some precision short of the upper bound is best for a group of so much less score."""
         hyper = (prior.shape - 1) * np.log(GRID) - prior.rate * GRID
         worth = GroupEvidence(self.s, max(share, 0.0) * self.q2).gain(GRID) + hyper
         return bool(worth[0] > worth[1] or np.any((worth[1:-1] > worth[:-2]) & (worth[1:-1] >= worth[2:])))

@@ -164,13 +164,13 @@ class Maximiser(Iterated, ABC):
         return "one start" if starts > 1 else ""
 
     def climbs_once(self, problem: Problem, prior: Prior) -> bool:
-        """Whether an answer is what one climb finds (and an integration there), so that many are one kernel."""
+        """True if an answer is what one climb finds (and an integration there), so that many are one kernel."""
         dense = self.expands_by(problem.model) is None
         return dense and not (self.integrates_places and problem.model.rests)
 
     @property
     def integrates_places(self) -> bool:
-        """Whether trajectories are integrated, so that places that are far from Gaussian matter."""
+        """True if trajectories are integrated, so that places that are far from Gaussian matter."""
         return self.trajectory == "marginal"
 
     def climb(
@@ -197,7 +197,7 @@ class Maximiser(Iterated, ABC):
         """One outer iteration."""
 
     def steps_on_host(self, model: Model, prior: Prior) -> bool:
-        """Whether iterations are long and few: those of a climb to the marginal mode alone.
+        """True if iterations are long and few: those of a climb to the marginal mode alone.
 
         Kernels shared with the rest of a fit then beat one of their own.
         """

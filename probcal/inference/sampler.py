@@ -53,7 +53,7 @@ class Sampler(Method, ABC):
         check_size(self.name, self.chains, self.warmup + self.draws)
 
     def takes(self, prior: Prior) -> bool:
-        """Whether there is a posterior to draw from, and the method can: a flat hyper-prior of ARD leaves none."""
+        """True if there is a posterior to draw from, and the method can: a flat hyper-prior of ARD leaves none."""
         return (
             super().takes(prior) and (prior.dense or self.atoms) and not (isinstance(prior, ARD) and prior.rate == 0.0)
         )

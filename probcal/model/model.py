@@ -420,7 +420,7 @@ class Model(Stepwise):
 
     @property
     def weighs_as_expected(self) -> bool:
-        """Whether step weights are the expected information: all noise of the data is Gaussian."""
+        """True if step weights are the expected information: all noise of the data is Gaussian."""
         return all(type(noise) is Normal for own in self.noises for noise in own)
 
     @property
@@ -430,12 +430,12 @@ class Model(Stepwise):
 
     @property
     def tailed(self) -> bool:
-        """Whether some process noise is not Gaussian."""
+        """True if some process noise is not Gaussian."""
         return any(part.tails for part in self.recursions)
 
     @property
     def learns_noise(self) -> bool:
-        """Whether a fit finds some of the noise: unknown levels, or precisions of tails."""
+        """True if a fit finds some of the noise: unknown levels, or precisions of tails."""
         return self.tailed or self.level_spread.shape[0] > 0
 
     @property
@@ -450,7 +450,7 @@ class Model(Stepwise):
 
     @property
     def rests(self) -> bool:
-        """Whether some target stands still at a place that is not known."""
+        """True if some target stands still at a place that is not known."""
         return any(own.any() for own in self.resting)
 
     def with_tilt(self, tilt: Tilt) -> "Model":

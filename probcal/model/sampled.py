@@ -158,7 +158,7 @@ def sampled_of(motion: Motion, dimension: int, levels: Mapping[str, int], values
 
 
 def has_density(motion: Motion) -> bool:
-    """Whether a motion without linear form says the density of its steps and of its start."""
+    """True if a motion without linear form says the density of its steps and of its start."""
     return all(getattr(type(motion), name) is not getattr(Motion, name) for name in ("log_density", "log_initial"))
 
 

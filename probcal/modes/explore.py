@@ -258,7 +258,7 @@ def reach(problem: Problem, a: Point, b: Point) -> Gap:
 
 
 def new(problem: Problem, point: Point, known: Sequence[Point], size: Gap) -> bool:
-    """Whether a point lies apart from all known ones by a fraction of the size of a reflection."""
+    """True if a point lies apart from all known ones by a fraction of the size of a reflection."""
     gaps = [distance(problem, point, other) for other in known]
     nodes = size.nodes if size.nodes > SHIFTED else np.inf
     tracks = size.tracks if size.tracks > 0 else np.inf

@@ -98,7 +98,7 @@ class _Piece(NamedTuple):
     place: np.ndarray  # (n, d) where it is
 
     def alike(self, other: "_Piece") -> bool:
-        """Whether it is the same piece, reflected to about the same places."""
+        """True if it is the same piece, reflected to about the same places."""
         if (self.recursion, self.target) != (other.recursion, other.target):
             return False
         both, mine, others = np.intersect1d(self.own, other.own, assume_unique=True, return_indices=True)

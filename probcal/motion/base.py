@@ -236,7 +236,7 @@ class LinearMotion(Motion):
 
     @property
     def static(self) -> bool:
-        """Whether nothing ever moves, so that all rows of a target form one epoch."""
+        """True if nothing ever moves, so that all rows of a target form one epoch."""
         return all(getattr(component, "static", False) for component in self.components)
 
     def _dimension(self, state: Any) -> int:

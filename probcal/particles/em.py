@@ -147,7 +147,7 @@ class Wandering:
 
 
 def wandering(trace: np.ndarray, sd: np.ndarray) -> Wandering:
-    """Whether the biases of the last iterations (I, M) scatter about a place, or still move."""
+    """True if the biases of the last iterations (I, M) scatter about a place, False if they still move."""
     size = min(WINDOW, len(trace) // 2)
     if size < 5:
         return Wandering(False, 0, np.inf)

@@ -120,5 +120,5 @@ def check_proposal(model: Model, how: ParticleSettings, *, conditional: bool = F
 
 
 def lost(log_weights: Any) -> Any:
-    """Whether all particles of an epoch are lost, by their log weights (..., M)."""
+    """True if all particles of an epoch are lost, by their log weights (..., M)."""
     return jnp.max(log_weights, -1) <= 0.5 * LOST

@@ -75,7 +75,7 @@ def biases(tree: xr.DataTree) -> tuple[list[str], list[dict[str, Any]]]:
 
 
 def weighted(tree: xr.DataTree) -> bool:
-    """Whether some data count less than others."""
+    """True if some data count less than others."""
     return "residual" in tree.children and bool((tree["residual"]["weight"] < 1).any())
 
 

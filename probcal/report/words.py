@@ -109,7 +109,7 @@ def next_step(tree: xr.DataTree) -> str:
 
 
 def _judged(tree: xr.DataTree) -> str:
-    """How many biases have which verdict."""
+    """The number of biases with each verdict."""
     count = Counter(listed_in(tree, "verdict", "verdict"))
     known = dict.fromkeys((*VERDICTS, *sorted(count)))
     told = [f"{count[name]} {name}" for name in known if count[name]]
@@ -124,7 +124,7 @@ def nothing_found(tree: xr.DataTree) -> str:
 
 
 def in_conflict(tree: xr.DataTree) -> bool:
-    """Whether some bias conflicts with the model or drifts."""
+    """True if some bias conflicts with the model or drifts."""
     return not set(ASIDE).isdisjoint(listed_in(tree, "verdict", "verdict"))
 
 

@@ -184,7 +184,7 @@ class Posterior:
 
     @property
     def sound(self) -> bool:
-        """Whether every number is finite: a flat prior on a singular problem leaves no interval."""
+        """True if every number is finite: a flat prior on a singular problem leaves no interval."""
         parts = self.summary.covariance.covariance, self.summary.mean
         return all(bool(np.isfinite(part).all()) for part in parts)
 

@@ -40,7 +40,7 @@ class SensorBlocks(NamedTuple):
 
     @property
     def whole(self) -> bool:
-        """Whether the covariance of all biases is held."""
+        """True if the covariance of all biases is held."""
         return self.members.shape == (1, self.biases)
 
     @property

@@ -118,7 +118,7 @@ def check_crossings(
             raise InputError(f'edge "{names[e]}" crosses itself; split it where it does, or name it in bridges')
 
     def clear(i: int, j: int, point: np.ndarray) -> bool:
-        """Whether one edge passes over the other at a point."""
+        """True if one edge passes over the other at a point."""
         if over[i] or over[j]:
             return True
         if nodes.shape[1] == 2:

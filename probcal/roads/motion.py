@@ -213,5 +213,5 @@ class Road(Motion):
         return levels["speed_std"] if "speed_std" in levels else guess_of(self.std)
 
     def holds(self, edge: Any, along: Any) -> jax.Array:
-        """Whether an arc length is one of the edge."""
+        """True if an arc length is one of the edge."""
         return (along >= 0) & (along <= jnp.asarray(self.network.lengths)[edge])

@@ -60,7 +60,7 @@ def power_law(
 
 
 def _in_decibels(problem: Problem, name: str) -> bool:
-    """Whether a channel is a level of sensors with one node."""
+    """True if a channel is a level of sensors with one node."""
     for kind in problem.network.types:
         channel = dict(kind.expand(problem.network.dimension)).get(name)
         if channel is not None and channel.unit in ("dB", "dBm") and kind.arity == 1:

@@ -54,7 +54,7 @@ class Counted:
         return cls(np.unique(keys), origin, epoch, streams)
 
     def rows(self, data: Measurements, network: Network, origin: str) -> np.ndarray:
-        """Whether each row (N,) has a datum of the tree; `origin` is the date of time 0 of these rows."""
+        """True if each row (N,) has a datum of the tree; `origin` is the date of time 0 of these rows."""
         shift = _shift(origin, self.origin)
         if shift is None:
             return np.zeros(len(data.time), bool)

@@ -445,7 +445,7 @@ class Online:
 
     @property
     def _moves(self) -> bool:
-        """Whether biases may move, so that the order of rows of different targets matters."""
+        """True if biases may move, so that the order of rows of different targets matters."""
         return bool(self.method.walk) or self.method.jumps is not None
 
     def prepare(self) -> None:

@@ -196,7 +196,7 @@ def _places(problem: Problem, truth: Truth) -> list[np.ndarray]:
 
 
 def _needs_linear(methods: Mapping[str, tuple[Method, Prior]]) -> bool:
-    """Whether some method asks for motions with a linear form."""
+    """True if some method asks for motions with a linear form."""
     return not all(method.by_particles for method, _ in methods.values())
 
 
@@ -236,7 +236,7 @@ def _record(run: _Run, answer: Answer) -> dict[str, Any]:
 
 
 def _climbs_once(method: Method, prior: Prior, run: _Run, oracle: bool) -> bool:
-    """Whether runs are solved together: not by samplers and particles, nor where a fit is more than one climb."""
+    """True if runs are solved together: not by samplers and particles, nor where a fit is more than one climb."""
     if not isinstance(method, Maximiser) or method.by_particles:
         return False
     return oracle or (method.climbs_once(run.problem, prior) and not run.problem.clocks.any())

@@ -90,6 +90,6 @@ def configure(problem: Problem, how: Rounds, prior: Prior, context: Context) -> 
 
 
 def _same(before: pd.DataFrame, after: pd.DataFrame) -> bool:
-    """Whether no pair of detection and track has another weight than before."""
+    """True if no pair of detection and track has another weight than before."""
     both = before.merge(after, on=["row", "track"], how="outer", suffixes=("", "_after")).fillna(0.0)
     return bool(np.all(np.abs(both["weight"] - both["weight_after"]) < ALIKE))

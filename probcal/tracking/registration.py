@@ -37,7 +37,7 @@ class Registration:
 
     @property
     def sound(self) -> bool:
-        """Whether two tracks or more agree, and no other frame explains nearly as much."""
+        """True if two tracks or more agree, and no other frame explains nearly as much."""
         return len(self.pairs) >= 2 and self.rivals == 0
 
     def apply(self, tracks: Any) -> pd.DataFrame:
@@ -242,7 +242,7 @@ def _refined(a: dict[str, Track], b: dict[str, Track], frame: Frame, cut: float,
 
 
 def _far(b: dict[str, Track], one: Frame, other: Frame, cut: float) -> bool:
-    """Whether two frames lay the tracks of the second list elsewhere."""
+    """True if two frames lay the tracks of the second list elsewhere."""
     places = np.concatenate([x for _, x in b.values()])
     away = in_frame(places, one[0], one[1]) - in_frame(places, other[0], other[1])
     return bool(np.sqrt(np.mean(np.sum(away**2, 1))) > APART * cut)

@@ -95,7 +95,7 @@ def _made(kind: Any, arguments: dict[str, Any], covar: np.ndarray) -> Any:
 
 
 def _same(model: Any, measured: Sequence[str], reading: SensorFunction, order: list[int], maker: ModelMaker) -> bool:
-    """Whether a model of Stone Soup computes what the declared sensor does, at places around it."""
+    """True if a model of Stone Soup computes what the declared sensor does, at places around it."""
     factor = np.array([angle_factor(channel) for _, channel in reading.channels])
     random, mapping = np.random.default_rng(0), maker.mapping
     state = random.normal(0.0, 300.0, (mapping.size, 8))

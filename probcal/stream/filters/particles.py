@@ -55,7 +55,7 @@ def first_cloud(states: State, z: jax.Array, root: jax.Array, count: int) -> Clo
 
 
 def ancestors(cloud: Cloud) -> int:
-    """How many particles of the start have descendants."""
+    """The number of particles of the start that have descendants."""
     return len(np.unique(np.asarray(cloud.origin)))
 
 

@@ -126,7 +126,7 @@ def _grow(found: Field, rng: np.random.Generator) -> int:
 
 
 def _clear(modes: list[Peak]) -> bool:
-    """Whether a search has one answer."""
+    """True if a search has one answer."""
     return modes[0].evidence > DECISIVE and all(mode.evidence < modes[0].evidence - RIVAL for mode in modes[1:])
 
 

@@ -195,7 +195,7 @@ def ascend(potential: Potential, start: np.ndarray) -> Peak | None:
 
 
 def same(potential: Potential, one: Peak, other: Peak) -> bool:
-    """Whether two modes lie within three of their sds."""
+    """True if two modes lie within three of their sds."""
     away = potential.apart(one.theta, other.theta)
     return bool(np.all(np.abs(away) < 3.0 * np.sqrt(np.diagonal(one.covariance + other.covariance))))
 
