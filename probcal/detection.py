@@ -1,4 +1,4 @@
-"""What a sensor reports of objects that nobody names: what it sees, how surely, and what is false."""
+"""The detection model for unnamed objects: field of view, probability, false detections."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -41,7 +41,8 @@ class Sector:
 
 @dataclass(frozen=True)
 class Detection:
-    """How a sensor detects objects that nobody names: `radar.on(node, detection=Detection(0.9, clutter=2.0))`.
+    """The detection model of a sensor for unnamed objects: `radar.on(node, detection=Detection(0.9,
+    clutter=2.0))`.
 
     `probability` is that of detecting an object in `view` (a function of target and pose with values from 0 to 1, such
     as `Sector`; None sees all) in one scan: the rows of one sensor at one time. `clutter` is the mean number of false
@@ -89,7 +90,7 @@ class Detection:
         return guess_of(self.clutter)
 
     def within(self, channel: str, unit: str, period: float | None) -> tuple[float, float] | None:
-        """Where the false detections of a channel lie; None where only the table tells."""
+        """The limits of the false detections of a channel; None where only the table gives them."""
         stated = dict(self.limits)
         if channel in stated:
             return stated[channel]

@@ -1,4 +1,5 @@
-"""What a function computes, as a text: equal for functions that compute the same, however often they are declared."""
+"""The fingerprint of a function, as text: equal for functions that compute the same, however often
+declared."""
 
 import hashlib
 import re

@@ -42,7 +42,7 @@ class FromField:
 
 @dataclass(frozen=True)
 class Topic:
-    """What the messages of a topic hold: a row each of a sensor, perhaps a target, and channels.
+    """The contents of a topic: each message is a row of a sensor, perhaps a target, and channels.
 
     `channels` maps the columns of the table to fields of the message, `{"range": "range"}`, with dots and indices
     (`pose.pose.position.x`, `ranges[0]`). A column may state the unit of its field, `"azimuth [deg]"`; those of common
@@ -151,7 +151,7 @@ def _opened(path: Path, types: Mapping[str, str] | None, distribution: str | Non
 
 
 def _said(error: Exception) -> str:
-    """What an error says, or what it is where it says nothing."""
+    """The message of an error, or the name of its type where the message is empty."""
     return str(error) or type(error).__name__
 
 
@@ -314,7 +314,7 @@ def _inside(message: Any) -> list[str]:
 
 
 def _follow(topic: str, message: Any, path: str) -> Any:
-    """What stands at a path of a message, `pose.position.x` or `ranges[0]`."""
+    """The value at a path of a message, `pose.position.x` or `ranges[0]`."""
     found, parts = message, _parts(path)
     for k, part in enumerate(parts):
         if isinstance(part, int):

@@ -1,4 +1,5 @@
-"""What the adapters share: extras imported late, instants, and reported positions in a local frame."""
+"""The shared parts of the adapters: late imports, instants, and reported positions in a local
+frame."""
 
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ def extra(module: str, what: str, name: str) -> Any:
 
 
 def file_bytes(path: AnyPath) -> bytes:
-    """What a file holds; raises `InputError` naming it."""
+    """The content of a file; raises `InputError` naming the file if it cannot be read."""
     try:
         return Path(path).read_bytes()
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""What further rows would tell: of another pass of a target, or of one more sensor.
+"""The information from further rows: another pass of a target, or one more sensor.
 
 Another pass is a target of its own: eliminated, it leaves an information of the few biases that it meets. A sensor adds
 rows to tracks that there are. Either sees what is as near as any sensor of its type saw a target.
@@ -41,7 +41,8 @@ REACHED = 1 + 1e-9  # of the reach of a type
 
 @dataclass(frozen=True, eq=False)
 class Informed:
-    """What the data tell at a point, under a prior of one scale (or the survey) of each bias."""
+    """The information of the data at a point, under a prior of one scale (or the survey) per
+    bias."""
 
     problem: Problem
     at: Expansion

@@ -179,7 +179,8 @@ def _tree(
 
 
 def _message(labels: np.ndarray, bounded: np.ndarray, loose: np.ndarray) -> str:
-    """What has no bound, and which of the bounded (M',) have one beyond their scale, in words."""
+    """A message on biases without a bound, and bounded ones (M',) whose bound exceeds their
+    scale."""
     found = []
     if not bounded.all():
         open_ = listed(labels[~bounded].tolist(), 12)

@@ -32,7 +32,7 @@ TOLD = 1.0  # information about a change, in declared scales, below which the da
 
 
 class Likelihood(NamedTuple):
-    """What one recording says of some biases, in z: -z'Gz/2 + h'z, and how much wider its sd are than that says."""
+    """The log-likelihood of biases from one recording, -z'Gz/2 + h'z in z, with its inflation."""
 
     labels: list[str]
     information: np.ndarray  # (M, M)
@@ -56,7 +56,7 @@ class Likelihood(NamedTuple):
 
 @checked
 def changes(first: xr.DataTree, second: xr.DataTree, *, names: Sequence[str] = ("first", "second")) -> xr.DataTree:
-    """What moved between two recordings of one network, second less first, with intervals.
+    """The changes between two recordings of one network, second less first, with intervals.
 
     `first` and `second` are results of `fit` (or loaded ones), best after `assess`, whose overdispersion widens the
     intervals. Returns a tree:
@@ -171,7 +171,8 @@ def _changes(said: Sequence[Likelihood], scale: np.ndarray) -> dict[str, np.ndar
 
 
 def _beside_each_other(both: pieces.Pieces, moved: list[int], inflation: np.ndarray) -> dict[int, pieces.Contrast]:
-    """How each bias that moved changed beside the others; what these explain away is common again, the least first."""
+    """The change of each moved bias given the others; drops those that these explain, least
+    first."""
     limit = limit_of(len(inflation))
     while moved:
         found = {m: _but(both, moved, m).get(m) for m in moved}
@@ -184,7 +185,7 @@ def _beside_each_other(both: pieces.Pieces, moved: list[int], inflation: np.ndar
 
 
 def _but(both: pieces.Pieces, free: Iterable[int], kept: int = -1) -> dict[int, pieces.Contrast]:
-    """How each bias changed where those that are free changed too, but for one."""
+    """The change of each bias where the biases in `free`, except `kept`, change too."""
     return pieces.contrasts(both, PATTERN, [(k, PATTERN) for k in free if k != kept])
 
 

@@ -33,7 +33,7 @@ NEEDS = ("explained", "answer", "factor", "draws", "truth")
 
 
 class Checked(NamedTuple):
-    """What a check found."""
+    """The results of a check."""
 
     groups: Mapping[str, xr.Dataset] = {}  # of the tree, by name
     findings: Sequence[Finding] = ()
@@ -54,7 +54,7 @@ class Case:
 
     @cached_property
     def has(self) -> frozenset[str]:
-        """What a fit has of `NEEDS`."""
+        """The entries of `NEEDS` that the fit provides."""
         status, engine = Status(self.tree.attrs["status"]), self.fit.engine
         drawable = engine.cheap or (engine.exact and not many_data(self.fit.problem.model))
         facts = status.explains, status not in INVALID, engine.exact, drawable, self.truth is not None
@@ -127,7 +127,7 @@ class Check:
     causes: Sequence[str]  # of an end without an answer that its findings may tell, "misfit" and "other"
 
     def __call__(self, case: Case) -> Checked:
-        """What the check finds."""
+        """The results of the check on a case."""
         return self.function(case)
 
 

@@ -1,4 +1,4 @@
-"""What a comparison is told besides its fits: how many there are, their names, pairs of biases."""
+"""The arguments of a comparison other than its fits: their number, their names, pairs of biases."""
 
 from collections.abc import Sequence
 

@@ -198,7 +198,7 @@ def _pairs(fits: Mapping[str, xr.DataTree], labels: list[str]) -> xr.Dataset:
 
 
 def _method(tree: xr.DataTree, labels: list[str]) -> xr.Dataset:
-    """What one fit says by bias beyond the columns of all, and its attributes."""
+    """The columns per bias that one fit has beyond those common to all fits, and its attributes."""
     group = tree["calibration"].to_dataset().sel(bias_label=labels)
     posterior, level = tree["posterior"].to_dataset(), float(tree.attrs["interval_probability"])
     columns = {name: group[name].values for name in FURTHER if name in group and np.isfinite(group[name]).all()}

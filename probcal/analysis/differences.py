@@ -1,4 +1,4 @@
-"""Where one method is enough and where it lies: a comparison in sentences.
+"""The sentences of a comparison: the biases for which one method is enough, or is wrong.
 
 Every method is judged by the reference: the first fit that was sampled, else the first. On a bias it is enough where
 its interval holds the mean of the reference and its sd is within a factor of `NARROW`; where it pruned the bias, if
@@ -50,7 +50,7 @@ def _doubts(name: str, method: xr.Dataset) -> list[Finding]:
 
 
 def _against(comparison: xr.DataTree, name: str, reference: str) -> list[Finding]:
-    """What the reference says of one method."""
+    """The findings on one method, judged by the reference."""
     level, other = float(comparison.attrs["interval_probability"]), comparison[f"method/{reference}"].to_dataset()
     frame = _by_bias(comparison, name, reference)
     total, found = len(frame), list[Finding]()

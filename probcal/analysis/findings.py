@@ -1,4 +1,4 @@
-"""What a check has to say: one sentence each."""
+"""The findings of a check: one sentence each."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -73,7 +73,7 @@ class _Refits(NamedTuple):
 
 
 class Left(NamedTuple):
-    """What the rest says of sensors or targets that were left out, each (groups,).
+    """The scores of sensors or targets that were left out, predicted by the rest, each (groups,).
 
     `elpd` is the log predictive density given the rest, `rest_nis` the mean square of its innovations predicted by the
     rest. Of sensors also the same with their own biases held at 0, and the `difference` of both densities: how much

@@ -52,7 +52,7 @@ class Level(NamedTuple):
 
 
 class Members(NamedTuple):
-    """Which level (by its place in `levels`) every datum and every process noise has, -1 where none."""
+    """The index in `levels` of every datum and every process noise, -1 where none."""
 
     levels: list[Level]
     rows: list[np.ndarray]  # (N, C) of each block
@@ -73,7 +73,7 @@ class Members(NamedTuple):
 
 
 class Wanted(NamedTuple):
-    """What the data ask for: where the evidence is largest by its expansion, and what would move with it."""
+    """The steps to the largest evidence by its expansion, and the shift of the biases with each."""
 
     step: np.ndarray  # (K,) of the log levels
     sd: np.ndarray  # (K,)
@@ -190,7 +190,7 @@ def _expanded(
 
 
 def ask(fit: Judged, members: Members, factors: Factors) -> Wanted | None:
-    """Where the evidence is largest in all log levels, from the fit on; None where it has no maximum.
+    """The steps from the fit to the largest evidence in all log levels; None without a maximum.
 
     `factors` are those of the prior of z that is held. What biases move is their covariance times what their score
     changes, the slope of any posterior mean by what is added to the score.
@@ -293,7 +293,7 @@ def _names(levels: list[Level]) -> list[str]:
 
 
 def _sentence(level: Level, factor: float, sd: float) -> str:
-    """What the data ask of a level, and how to let them have it."""
+    """A sentence on the size of a level that the data ask for, and the remedy."""
     what = "what the table has" if level.declared is None else f"the declared {level.declared:g}"
     if abs(np.log(factor)) >= FARTHEST:
         size = f"far {'more' if factor > 1 else 'less'} than {what}"
@@ -306,7 +306,7 @@ def _sentence(level: Level, factor: float, sd: float) -> str:
 
 
 def _moved(problem: Problem, moved: np.ndarray) -> str:
-    """What hangs on a level, `moved` (M,) by it in sd."""
+    """A clause on the biases that are sensitive to a level, which moves them by `moved` (M,) sd."""
     far = [m for m in np.argsort(-np.abs(moved)) if abs(moved[m]) > HANGS]
     if not far:
         return ""

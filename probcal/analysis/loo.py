@@ -1,4 +1,5 @@
-"""How well fits of the same data predict: elpd by PSIS-LOO of every datum, and the paired difference to the best.
+"""The predictive accuracy of fits of the same data: elpd by PSIS-LOO per datum, and the paired
+difference to the best.
 
 Vehtari, Gelman and Gabry 2017; they are what `arviz.loo` and `arviz.compare` give.
 """

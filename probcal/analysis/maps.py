@@ -134,7 +134,7 @@ def _axes(area: Sequence[Sequence[float]], cells: int | tuple[int, int]) -> list
 
 
 def _nodes(at: Problem, z: np.ndarray) -> np.ndarray:
-    """Where the nodes of a snapshot stand, their biases z (M,) added, (nodes, d)."""
+    """The positions (nodes, d) of the nodes of a snapshot, with their biases z (M,) added."""
     found = []
     shift = at.fixed | dict(zip(at.labels, z * at.scales, strict=True))
     for record in at.network.biases:

@@ -1,5 +1,4 @@
-"""What the data of a problem can and cannot determine: information of all biases, trajectories
-marginalised."""
+"""The observability of all biases of a problem: their information, trajectories marginalised."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -38,7 +37,8 @@ SCREENED = (
 
 @float64
 def observability(problem: Problem, *, point: Point | None = None, truth: Truth | None = None) -> xr.DataTree:
-    """What data and surveys determine, before any fit: a tree whose directions, biases and sensors bear names.
+    """The observability from data and surveys, before any fit: a tree of named directions, biases
+    and sensors.
 
     The information of the biases has every trajectory marginalised (papers README, standard forms) and is in units of
     the prior scale. It is taken at the automatic start, at a `truth` (tracks and biases: to plan before there are
@@ -114,8 +114,8 @@ def _directions(
 
 
 def _status(least: float, gauge: bool) -> str:
-    """What the least information of any direction means for a fit; a gauge is never determined by
-    its motion alone."""
+    """The status of a fit from the least information of any direction; a gauge is never determined
+    by its motion alone."""
     word = narrowed(1.0 - 1.0 / (1.0 + least))
     if word == "prior only":
         return "open"

@@ -1,4 +1,5 @@
-"""How far two marginal posteriors of a bias lie apart: overlap coefficient and Wasserstein distance, in scales.
+"""The distance between two marginal posteriors of a bias: overlap coefficient and Wasserstein
+distance, in scales.
 
 A Gaussian posterior is taken as such, any other by its draws. Of a posterior with a point mass at zero (the spike of
 spike and slab, a bias that evidence approximation pruned) nobody can say which density has the higher peak there:
@@ -42,7 +43,7 @@ def of_gaussian(mean: float, sd: float, pruned: bool) -> Marginal:
 
 
 def of_draws(draws: np.ndarray) -> Marginal:
-    """What draws (any shape) tell; those that are exactly zero are a point mass."""
+    """The marginal of draws (any shape); those that are exactly zero are a point mass."""
     return Marginal(np.sort(draws, axis=None), None, bool((draws == 0).any()))
 
 

@@ -67,7 +67,7 @@ class Pieces(NamedTuple):
 
 
 class Contrast(NamedTuple):
-    """How one bias differs between pieces, in z: the coefficients of a pattern (P, q) beside a common level."""
+    """The difference of one bias between segments, in z: a pattern (P, q) about a common level."""
 
     estimate: np.ndarray  # (q,)
     information: np.ndarray  # (q, q)
@@ -137,7 +137,7 @@ def of_expansion(fit: Judged, at: Expansion) -> Pieces:
 
 
 def contrasts(pieces: Pieces, pattern: np.ndarray, free: Sequence[tuple[int, np.ndarray]] = ()) -> dict[int, Contrast]:
-    """How each bias alone differs between the pieces along a pattern (P, q), all others common to all pieces.
+    """The difference of each bias along a pattern (P, q) of the segments, all others common to all.
 
     The biases in `free` differ too, each along its own pattern. What is common has the prior of the fit, the level of
     a bias that differs none. A bias about whose difference the data say nothing is left out.

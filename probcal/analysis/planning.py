@@ -1,4 +1,5 @@
-"""What to measure next: the expected information gain of another pass, a survey or a further sensor.
+"""The choice of the next measurement: the expected information gain of another pass, a survey or a
+further sensor.
 
 A gain is 1/2 log det of the information of all biases with the addition over that without it, in nats, under a
 prior of one scale (or the survey), trajectories marginalised (Lindley 1956).
@@ -32,7 +33,7 @@ MARGIN = 0.2  # of the area around nodes and tracks
 def next_passes(
     problem: Problem, *, point: Point | None = None, truth: Truth | None = None, passes: Any = None
 ) -> xr.Dataset:
-    """What one more pass of a target would tell, and where: gain (nats) and weak directions left, the best first.
+    """The gain (nats) of each further pass of a target, and weak directions left, the best first.
 
     It passes at the instants of the target with most rows (its first 300), attribute `pattern`, and is seen by the
     sensors that it comes as near to as any of their type was to a target (attribute `reach`, m, the largest of all
@@ -71,7 +72,7 @@ def next_passes(
 def next_anchors(
     problem: Problem, *, point: Point | None = None, truth: Truth | None = None, survey: float = SURVEY
 ) -> xr.Dataset:
-    """What a survey of a bias, or of a node's position, would tell of the others: gain (nats), weak directions left.
+    """The gain (nats) from a survey of a bias or of a node's position; weak directions left.
 
     `survey` is its std over the scale of the bias, `std` the same in the unit of the bias. `gain` is what it tells of
     all other biases, `own` that and what it says of itself. Biases that have a survey are left out where others have
@@ -157,7 +158,7 @@ def _anchors(problem: Problem) -> dict[str, list[int]]:
 def next_sensors(
     problem: Problem, *, point: Point | None = None, truth: Truth | None = None, places: Any = None
 ) -> xr.Dataset:
-    """What one more sensor of each type, its pose known, would tell about the biases that there are: gain (nats).
+    """The gain (nats) about the present biases from one more sensor of each type, its pose known.
 
     It sees every target at every epoch at which that is as near as any sensor of its type saw one; its own biases are
     free. `places` (P, d) in m are by default a grid over the area; the second node of a two-node type is that of its

@@ -46,7 +46,7 @@ class Compared(NamedTuple):
 
 @check("explained", "factor", causes=["other"])
 def check_segments(case: Case) -> Checked:
-    """What each bias would change from the first half of the recording to the second, and which of them do.
+    """Tests the change of each bias from the first half of the recording to the second.
 
     Biases drift, targets disagree on them, or they would move by more than `levels.HANGS` sd if others may change.
     """

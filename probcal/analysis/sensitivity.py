@@ -1,4 +1,5 @@
-"""How biases that nobody calibrates spoil the tracks (thesis 3.4, figure 3.6), by simulation and to first order."""
+"""The effect of uncalibrated biases on the tracks (thesis 3.4, figure 3.6), by simulation and to
+first order."""
 
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase

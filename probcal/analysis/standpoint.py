@@ -1,4 +1,4 @@
-"""Where information is taken: the automatic start, a truth, or draws from the motion."""
+"""The points where information is taken: the automatic start, a truth, or draws from the motion."""
 
 from collections.abc import Sequence
 
@@ -75,7 +75,7 @@ def draw_states(problem: Problem, count: int, key: jax.Array | None) -> States:
 
 
 def true_states(problem: Problem, truth: Truth) -> list[np.ndarray]:
-    """What the tracks say of the states (E, n) of each recursion, NaN where they say nothing; whole targets only."""
+    """The states (E, n) of each recursion from the true tracks, else NaN; whole targets only."""
     truth.check_targets(problem.measurements.target_names)
     found = []
     for epochs in problem.epochs:

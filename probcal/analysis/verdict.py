@@ -56,7 +56,7 @@ Doubts = Mapping[str, Mapping[int, str]]  # reason by bias, by the verdict that 
 
 
 class Grounds(NamedTuple):
-    """What the verdicts rest on, each (M,) in z."""
+    """The quantities behind the verdicts, each (M,) in z."""
 
     contraction: np.ndarray  # s
     pull: np.ndarray  # sd from the prior, 0 where the prior follows the data
@@ -75,7 +75,7 @@ def gaussian_interval(mean: np.ndarray, sd: np.ndarray) -> np.ndarray:
 
 
 def narrowed(share: float) -> str:
-    """What a share s of an answer that the data give is worth in words."""
+    """The verdict in words for the share s of an answer that the data give."""
     return "prior only" if share < PRIOR_ONLY else "weak" if share < WEAK else "determined"
 
 

@@ -17,7 +17,8 @@ COLUMNS = ("unit", "scale", "first", "second", "change", "sd", "lower", "upper",
 
 
 def run(first: Path, second: Path, names: Sequence[str] | None, outputs: Outputs | None) -> int:
-    """What moved between two recordings: one row a bias, second less first with its interval, and findings."""
+    """Reports the changes between two recordings: a row per bias, second less first, and
+    findings."""
     found = changes(load(first), load(second), names=names or ("first", "second"))
     frame = rows_of(found)
     print(frame.to_string(index=False, justify="right", float_format=lambda value: f"{value:.4g}"))

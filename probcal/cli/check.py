@@ -73,7 +73,7 @@ def _planned(problem: Problem, start: Point) -> Plans:
 
 
 def _print_plans(plans: Plans) -> None:
-    """What to measure next; of many biases without how many directions would be left."""
+    """Prints the best next measurements; for many biases without the number of directions left."""
     passes, anchors, sensors_ = plans
     counted = "weak" in anchors
     before = f"weak directions now: {anchors.attrs['weak_before']}. " if counted else ""

@@ -1,4 +1,4 @@
-"""What the commands write: tables in one step, the report."""
+"""The output files of the commands: tables in one step, the report."""
 
 import importlib.util
 from collections.abc import Callable, Mapping, Sequence

@@ -150,7 +150,7 @@ def written(tree: xr.DataTree, network: Network, outputs: Outputs) -> list[Path]
 
 @contextmanager
 def _safe(tree: xr.DataTree, outputs: Outputs | None, long: bool) -> Iterator[None]:
-    """What is found is safe whatever comes: written first where it took long, else where its assessment fails."""
+    """Keeps a fit safe: writes it first where it took long, else if its assessment fails."""
     written = False
 
     def write() -> None:

@@ -94,7 +94,7 @@ class ModelFile:
         return _module_of(self)
 
     def setting(self, run: int, **point: Any) -> Any:
-        """What the setting(run, ...) of the file returns: a problem and its truth."""
+        """The result of setting(run, ...) of the file: a problem and its truth."""
         return call(self.module(), self.path, "setting", run, **point)
 
 

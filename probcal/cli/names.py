@@ -10,7 +10,7 @@ from probcal.wings import installed
 
 
 class KnownMethod(NamedTuple):
-    """What the command line knows of a method."""
+    """The properties of a method that the command line knows."""
 
     title: str  # its name in results
     chains: bool  # whether it draws them

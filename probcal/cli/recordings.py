@@ -33,7 +33,7 @@ REFUSED = "refused"  # status of a recording that cannot be fitted
 
 @dataclass(frozen=True)
 class Recordings:
-    """What the fits of all recordings have in common; called with one of them it fits it and returns its rows."""
+    """The common settings of all fits; a call with one recording fits it and returns its rows."""
 
     model: ModelFile
     out: Path
@@ -42,7 +42,7 @@ class Recordings:
     overwrite: bool
 
     def identity(self, digest: str) -> dict[str, str]:
-        """What the fit of a table is, by the names that an error gives it."""
+        """The identity of the fit of a table, by the names that error messages use."""
         options = {name: repr(value) for name, value in sorted(self.options.items()) if name != "network"}
         if (network := self.options["network"]) is not None:
             options["network"] = digest_of_file(network)

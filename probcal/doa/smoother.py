@@ -133,7 +133,7 @@ def _driven(state: np.ndarray, dt: float, noise: float) -> np.ndarray:
 
 
 def _curved(state: np.ndarray, covariance: np.ndarray, dt: float) -> float:
-    """What the second-order term adds to the predicted 1/r: the bias of a filter of the first order."""
+    """The second-order term of the predicted 1/r: the bias of a first-order filter."""
     c = dt * state[:3] + np.array([0.0, 0.0, 1.0])
     squared = c @ c
     slope = -dt * c * squared**-1.5

@@ -53,7 +53,7 @@ class Cholmod(Factor):
             self._token = jax.block_until_ready(self._library.factor(*self._entries, self.places.size))
 
     def _asked(self, ask: Callable[[Any], Any]) -> Any:
-        """What the factor says; it is made again where other threads made it go."""
+        """The answer of the factor to a request; factorises again if other threads evicted it."""
         while True:
             try:
                 with _calling():

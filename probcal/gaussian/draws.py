@@ -137,7 +137,7 @@ def predictive(
 
 
 class Remainder(NamedTuple):
-    """What is left of every datum at a point, zero where missing."""
+    """The residual statistics of every datum at a point, zero where missing."""
 
     innovation: Data
     std: Data  # noise level

@@ -20,7 +20,7 @@ from probcal.priors import Precision
 
 
 class Expected(NamedTuple):
-    """What an E-step leaves for the M-step."""
+    """The results of an E-step for the M-step."""
 
     point: Point  # the same biases, trajectories at the mode or mean of their density given these
     # (S, p, p) of the biases of each sensor of each block at fixed trajectories, expected over them
@@ -34,7 +34,7 @@ class EStep(ABC):
     """The expectation over trajectories given the biases; a frozen dataclass, for a kernel is compiled for each."""
 
     def begin(self, model: Model, point: Point) -> Any:
-        """What is carried to the first step: nothing, unless said otherwise."""
+        """The state carried into the first step, empty by default."""
         return ()
 
     @abstractmethod

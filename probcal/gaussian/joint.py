@@ -26,8 +26,7 @@ from probcal.model.rows import LinearRows
 
 
 def missing(model: Model) -> str:
-    """What a model has that the sparse form does not take, in words; empty where it takes the
-    model."""
+    """A feature of a model that the sparse form does not take, in words; empty if it takes all."""
     if any(form is not None for form in model.sampled):
         return "a motion without a linear form"
     if any(not np.all(_drives(part) | _carries(part) | _fixes(part)) for part in model.recursions):
@@ -54,8 +53,7 @@ def _fixes(part: Any) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class JointPrecision:
-    """Where the entries of the joint precision of a model come from: states first, then the M
-    biases.
+    """The sources of the entries of a model's joint precision: states first, then the M biases.
 
     `kept` (entries,) are their places among all values of `_values`, `times` (entries,) what each
     counts. A state that stays what it was has the variables of the epoch before; one that is known
@@ -144,8 +142,7 @@ class JointPrecision:
         return np.where(pairs >= 0, inverse[pairs], np.eye(members.shape[1])[None] * none[:, None])
 
     def pairs(self, members: np.ndarray) -> np.ndarray:
-        """Where the entries (B, p, p) of pairs of biases (B, p) are, -1 where there is no pair; M
-        is no bias."""
+        """The indices of the entries (B, p, p) of pairs of biases (B, p), else -1; M is no bias."""
         order, keys = self._order
         low = np.minimum(members[:, :, None], members[:, None, :]) + self.states
         high = np.maximum(members[:, :, None], members[:, None, :]) + self.states

@@ -82,7 +82,7 @@ class Eliminated(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """What elimination keeps of one recursion."""
+    """The quantities that elimination keeps for one recursion."""
 
     J: jax.Array  # (E, n, n) information of the rows about the states
     pull: jax.Array  # (E, n) their score
@@ -155,7 +155,7 @@ def mixed_density(model: Model, point: Point) -> jax.Array:
 
 
 def mixing_gain(model: Model) -> Any:
-    """What the evidence at the mean precisions lacks of its variational bound, the precisions uncertain.
+    """The variational bound less the evidence at the mean precisions, for uncertain precisions.
 
     With q(trajectory) q(w), log p(data) is at least the evidence at E w and this sum (Ting, Theodorou, Schaal 2007).
     """
@@ -259,7 +259,7 @@ def eliminate_compressed(
 
 
 def kept_of(model: Model, levels: jax.Array, compressed: Compressed) -> tuple[Kept, ...]:
-    """What the elimination of trajectories at log levels (H,) keeps of each recursion."""
+    """The quantities that eliminating trajectories at log levels (H,) keeps for each recursion."""
     parts = model.each_layout(compressed.states, compressed.crosses)
     return tuple(
         Kept(J, pull, cross, gains_of(part, levels, J, model.entries(r)))

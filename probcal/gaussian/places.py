@@ -52,7 +52,8 @@ def places_of(model: Model, point: Point) -> tuple[Still, ...] | None:
 
 
 def tilt_of(model: Model, point: Point, still: tuple[Still, ...]) -> Tilt | None:
-    """What exact integrals over chosen places add to Laplace's formula near a consistent point; None if not finite.
+    """The Laplace correction from exact integrals over chosen places near a consistent point; None
+    if not finite.
 
     Its curvature is what the information of the biases becomes: expected information less the variance of the score
     over the places (Louis 1982), in the place of the Schur complement.
@@ -81,7 +82,8 @@ def tilt_of(model: Model, point: Point, still: tuple[Still, ...]) -> Tilt | None
 
 
 def tilt_at(model: Model, point: Point) -> Tilt:
-    """What exact integrals over places add near a consistent point of a model, whatever tilt that has; else nothing."""
+    """The Laplace correction from places near a consistent point, whatever the model has; else
+    none."""
     none = Tilt.none(model.biases)
     plain = model.with_tilt(none)
     places = places_of(plain, point)
@@ -189,7 +191,8 @@ def _moments(
 
 @jax.jit
 def _schur(model: Model, point: Point, still: tuple[Still, ...]) -> jax.Array:
-    """What Laplace's formula takes the chosen places to leave unknown: J_zx W^-1 J_xz (M, M) summed over targets."""
+    """The information that Laplace's formula loses to the chosen places: J_zx W^-1 J_xz (M, M)
+    summed over targets."""
     lins = model.linearise(point, expected=True)
     J = model.by_target([own for own, _ in model.of_states(lins)])
     cross = model.by_target(model.of_both(lins))

@@ -17,7 +17,8 @@ from probcal.linalg import forward, multiply_rows, preceding, semi_cholesky
 
 
 class Gains(NamedTuple):
-    """What the covariance pass leaves for any number of columns, u entries of the state being read by rows."""
+    """The results of the covariance pass for any columns, u entries of the state being read by
+    rows."""
 
     data: jax.Array  # (E, n, u) root G of the information
     solve: jax.Array  # (E, u, n) y = solve b solves G y = b
@@ -57,7 +58,7 @@ def gains(F: jax.Array, L: jax.Array, J: jax.Array, used: tuple[int, ...]) -> Ga
 
 
 class Predicted(NamedTuple):
-    """What is known of each epoch before its data, and what these change."""
+    """The prediction of each epoch before its data, and the change that the data make."""
 
     states: jax.Array  # (E, n, m)
     alone: jax.Array  # (E, u, m) the data y of b

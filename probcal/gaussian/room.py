@@ -1,4 +1,4 @@
-"""How much the dense form of a problem holds, and where it is too much."""
+"""The memory needed by the dense form of a problem, and its limit."""
 
 from probcal.errors import InputError
 from probcal.model.model import Model

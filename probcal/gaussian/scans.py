@@ -88,7 +88,8 @@ def inverse_root(data: jax.Array, gain: jax.Array, std: jax.Array) -> jax.Array:
 
 
 class _Segment(NamedTuple):
-    """What a stretch of epochs makes of the state before it: A x, of root U, and what it tells of it, Z Z'."""
+    """The transition of a segment, A x of root U, and its information Z Z' on the state before
+    it."""
 
     A: jax.Array  # (E, n, n)
     U: jax.Array  # (E, n, n)

@@ -1,1 +1,1 @@
-"""What data and surveys leave open: gauge and weak directions, their names, and remedies that are checked."""
+"""The directions that data and surveys leave open: gauge or weak, their names, checked remedies."""

@@ -97,7 +97,8 @@ def _within(problem: Problem, point: Point, basis: np.ndarray) -> Within:
 
 
 def unfixed(problem: Problem, point: Point, vectors: np.ndarray) -> np.ndarray:
-    """Which of some combinations (M, k) no row fixes: each by itself, where the biases are too many for `gauge`."""
+    """A mask (k,) of combinations (M, k) that no row fixes, each alone: for biases too many for
+    `gauge`."""
     found = _within(problem, point, vectors)
     survey = (problem.surveyed[:, None] * vectors**2).sum(0)
     left, known = np.diagonal(np.asarray(found.left)) + survey, np.asarray(found.known) + survey

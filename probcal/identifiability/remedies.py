@@ -1,4 +1,5 @@
-"""What removes an open direction: biases to fix or to survey, each kept only if recomputing shows that it does."""
+"""The remedies for an open direction: biases to fix or survey, kept only if recomputing confirms
+them."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace

@@ -1,4 +1,5 @@
-"""What a fit ran along: gauge directions that no row fixes, and starts of targets that nobody declared."""
+"""The directions in which a fit ran far: gauge directions that no row fixes, and undeclared starts
+of targets."""
 
 from __future__ import annotations
 

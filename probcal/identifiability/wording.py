@@ -16,7 +16,7 @@ def owner_of(label: str) -> str:
 
 
 def name_without_owner(label: str) -> str:
-    """What a bias is, without its owner."""
+    """The name of a bias, without its owner."""
     return label_parts(label)[1]
 
 
@@ -27,7 +27,7 @@ def in_words(label: str) -> str:
 
 
 def amount(problem: Problem, label: str, size: float) -> str:
-    """How much a bias moves by `size` scales, with its unit."""
+    """The change of a bias by `size` scales, as text with its unit."""
     m = problem.labels.index(label)
     return f"{label} {size * problem.scales[m]:+.2g} {problem.biases[m].unit}"
 

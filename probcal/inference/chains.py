@@ -40,7 +40,7 @@ class Draw(NamedTuple):
 
 
 def keep(form: Form, posed: Posed, sample: Sample) -> Draw:
-    """What is kept of a draw: gamma and the variance given its hyper-parameters, its trajectories."""
+    """The stored values of a draw: gamma and variance given its hyper-parameters, trajectories."""
     M = form.biases
     given = conditional(form, posed, sample.phi)
     variance = given.variance[:M]

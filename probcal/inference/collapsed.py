@@ -31,7 +31,7 @@ STEP = 1.3  # of a swing, over the fourth root of the dimension (Beskos and othe
 
 
 class CollapsedState(NamedTuple):
-    """Where a chain stands."""
+    """The state of a chain."""
 
     theta: jax.Array
     eps: States
@@ -156,7 +156,7 @@ class Collapsed(FramedSampler):
         return CollapsedState(*at, key), Sample(at.theta, at.eps, at.phi, joint, stats)
 
     def place(self, form: Form, posed: Posed, chain: CollapsedState) -> Place:
-        """Where a chain stands."""
+        """The position of a chain."""
         return Place(chain.theta, chain.eps, chain.phi, chain.weight)
 
     def put(self, form: Form, posed: Posed, chain: CollapsedState, at: Place) -> CollapsedState:

@@ -19,7 +19,7 @@ class Free(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """What coordinates stand for, and the log densities there."""
+    """The parameters that coordinates represent, and the log densities there."""
 
     theta: jax.Array
     phi: Phi

@@ -250,7 +250,7 @@ class EA(Maximiser):
         return Integration(form, self.trajectory == "marginal", len(form.hierarchy.learnt) <= MANY)
 
     def note(self, prior: Prior) -> str:
-        """What the intervals are worth with these settings and a prior."""
+        """A note on the validity of the intervals with these settings and a prior."""
         return self.intervals if self.integrates(prior) else self.plugged
 
     def remark(self, prior: Prior) -> str:

@@ -193,7 +193,7 @@ class EM(Maximiser):
         return isinstance(self.e_step, ParticleSmoother)
 
     def note(self, prior: Prior) -> str:
-        """What the intervals are worth."""
+        """A note on the validity of the intervals."""
         return BY_PATHS if self.by_particles and not prior.learns else super().note(prior)
 
     def task(self, problem: Problem, prior: Prior, start: Point, context: Context) -> MethodTask:
@@ -213,7 +213,7 @@ class EM(Maximiser):
         return _iterate(model, prior, given, state, self, MatrixStep())
 
     def begin(self, model: Model, start: Point) -> Any:
-        """What the E-step carries to its first step."""
+        """The state that the E-step carries into its first step."""
         assert isinstance(self.e_step, EStep)
         return self.e_step.begin(model, start)
 

@@ -1,4 +1,4 @@
-"""How a climb to a point ended: the answer, its status, and one sentence on what to do."""
+"""The end of a climb to a point: the answer, its status, and one sentence on what to do."""
 
 from __future__ import annotations
 
@@ -143,7 +143,8 @@ def bias_status(problem: Problem, masks: Mapping[str, np.ndarray]) -> tuple[str,
 
 
 def low_and_far(prior: Prior, summary: Summary, surveyed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which biases (M,) stand at the bound that their precision sets, and which ran away without a prior."""
+    """Masks (M,) of biases at the bound that their precision sets, and of those that ran away
+    without a prior."""
     none, mean = np.zeros(len(surveyed), bool), np.nan_to_num(summary.mean, nan=np.inf)
     far = astray(prior, mean, surveyed)
     if summary.precisions == "integrated":
@@ -153,7 +154,8 @@ def low_and_far(prior: Prior, summary: Summary, surveyed: np.ndarray) -> tuple[n
 
 
 def astray(prior: Prior, mean: Any, surveyed: Any) -> Any:
-    """Which biases (M,) of these means, over their scales, ran away: only a prior without scales lets them."""
+    """A mask (M,) of means, over their scales, that ran away: possible only without prior
+    scales."""
     return (abs(mean) > FAR) & ~surveyed & isinstance(prior, Flat)
 
 

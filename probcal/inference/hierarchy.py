@@ -1,4 +1,5 @@
-"""What samplers make of a prior: its hyper-parameters, their densities, and their conjugate updates given the biases.
+"""The form of a prior for samplers: hyper-parameters, their densities, and their conjugate updates
+given the biases.
 
 A `Hierarchy` is the static part (which biases it governs, in which groups); its variables `phi` are a dict of arrays.
 Given them the biases are Gaussian of precision `alpha(phi)`, so that every prior but the spike is a scale mixture. To
@@ -91,7 +92,7 @@ class Hierarchy(ABC):
 
     @abstractmethod
     def drawn(self) -> dict[str, Callable[[jax.Array], jax.Array]]:
-        """How each of them is drawn by a key; apart from `hyper`, so that what only draws need not load numpyro."""
+        """The functions of a key that draw them; apart from `hyper`, to draw without numpyro."""
 
     @abstractmethod
     def governed(self, phi: Phi) -> jax.Array:
@@ -108,7 +109,7 @@ class Hierarchy(ABC):
         return first.at[jnp.asarray(self.learnt)].set(jnp.clip(self.governed(phi), LEAST, MOST))
 
     def active(self, phi: Phi, biases: int) -> jax.Array:
-        """Which biases are not exactly zero, (M,)."""
+        """A mask (M,) of the biases that are not exactly zero."""
         return jnp.ones(biases, bool)
 
     def draw(self, key: jax.Array) -> Phi:
@@ -525,7 +526,8 @@ def held(prior: Prior, problem: Problem) -> np.ndarray:
 
 
 def learnt_groups(prior: Prior, problem: Problem) -> np.ndarray:
-    """Which learnt precision governs each bias, (M,), numbered from 0; those that are held share none."""
+    """The index (M,) of the learnt precision of each bias, numbered from 0; held ones share
+    none."""
     group, count = np.arange(len(problem.biases)), len(problem.biases)
     parts, part = prior.parts(problem.biases)
     for k, (_, one) in enumerate(parts):

@@ -1,4 +1,4 @@
-"""What a run is: digests of model and data, with the settings and versions under which its results were made."""
+"""The identity of a run: digests of model and data, and the settings and versions used."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from probcal.results.schema import RESULTS_VERSION
 
 
 def identity_of(problem: Problem, **settings: Any) -> dict[str, str]:
-    """What runs must share to be one run, by the name that an error gives it."""
+    """The properties that runs must share to be one run, by the names that error messages use."""
     labels = " ".join(problem.labels)
     return identity(**settings) | {
         "data": data_digest(problem), "list of biases": labels, "model": model_digest(problem),
@@ -104,7 +104,7 @@ def model_digest(problem: Problem) -> str:
 
 
 def _code(block: Block, rows: Rows, levels: int) -> str:
-    """What a block computes: its sensors, and the densities and weights of its noise."""
+    """The fingerprint of a block: its sensors, and the densities and weights of its noise."""
 
     def noise(rows: Rows, predicted: jax.Array, levels: jax.Array) -> Any:
         weights = weigh(block, rows, predicted, levels, expected=False)

@@ -58,7 +58,7 @@ class Integration:
 
 
 class Moments(NamedTuple):
-    """What a mixture says of the biases z."""
+    """The moments of the biases z under a mixture."""
 
     mean: Any  # (M,)
     covariance: Any  # (M, M)
@@ -68,7 +68,7 @@ class Moments(NamedTuple):
 
 
 class Integrated(NamedTuple):
-    """Where the integration ended: the mixture, its draws, and the likelihood behind it."""
+    """The result of the integration: the mixture, its draws, and the likelihood behind it."""
 
     point: Point  # biases at the mean, trajectories at their mode
     information: Any  # (M, M) of the data about z; None where it is not held

@@ -48,7 +48,7 @@ NUMBERS = 4_000_000  # most numbers of draws of states, and of hyper-parameters 
 
 
 class SweepState(NamedTuple):
-    """Where all chains stand, and what they share."""
+    """The states of all chains, and the quantities that they share."""
 
     at: Any  # (C, n + H) states, biases and log levels
     phi: Any  # (C, ...) of each hyper-parameter
@@ -110,7 +110,7 @@ class GibbsChains(Chains):
         return self._reference
 
     def _given(self, reference: Reference, phi: Phi) -> SplitGaussian:
-        """What hyper-parameters leave; factorised once where there are none."""
+        """The Gaussian given the hyper-parameters; factorised once where there are none."""
         alpha, last = np.asarray(precisions(self.form, phi, self.first)), self._last
         if last is None or last.reference is not reference or not np.array_equal(last.alpha, alpha):
             self._last = last = SplitGaussian.of(reference, alpha, self.coupled)
@@ -243,7 +243,7 @@ class GibbsChains(Chains):
         raise diverged(self.problem, self.engine.at(self.model, self.start), self.factors) from None
 
     def _draw(self, chain: _Chain) -> Draw:
-        """What is kept of a chain where it stands."""
+        """The stored draw of a chain at its present state."""
         at, z, none = chain.at, chain.at[self.model.state_size :], np.zeros(0)
         value = chain.reference.log_density(at) + log_prior_of(self.form, chain.phi, self.first, z)
         value += float(jnp.sum(log_prior_levels(self.model, chain.levels)))

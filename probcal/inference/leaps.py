@@ -14,7 +14,7 @@ from probcal.model.trajectories import States
 
 
 class Place(NamedTuple):
-    """Where a chain stands, in the frame's coordinates."""
+    """The position of a chain, in the coordinates of the Gaussian reference."""
 
     theta: jax.Array  # (Q,)
     eps: States

@@ -1,4 +1,4 @@
-"""What run a folder holds: its manifest, the names of its parts, and their removal; nothing heavy is loaded.
+"""The run in a folder: its manifest, the names of its parts, their removal; loads nothing heavy.
 
 The parts of a run are numbered files, or one zarr store: the fits of a study.
 """
@@ -105,7 +105,7 @@ def read_manifest(path: Path) -> tuple[str, dict[str, str]]:
 
 
 def described(path: Path) -> str:
-    """What runs in a folder, for a sentence."""
+    """The description of the run in a folder, for a sentence."""
     kind, identity = read_manifest(path)
     words = {
         "draws": "a sampler's run",
@@ -156,7 +156,7 @@ def stored_digest(path: AnyPath) -> str:
 
 
 def stored_run(path: AnyPath) -> str:
-    """What the run in a folder is, in a few words; empty where there is none."""
+    """A short description of the run in a folder; empty where there is none."""
     path = Path(path)
     if not path.is_dir() or not (path / MANIFEST).exists() or not holds_parts(path):
         return ""

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class Given(NamedTuple):
-    """What stays the same during the outer loop."""
+    """The constants of the outer loop."""
 
     prior: Precision  # first precisions, and the couplings of correlated biases
     surveyed: jax.Array  # (M,) biases whose precision is never learnt
@@ -36,7 +36,8 @@ class Given(NamedTuple):
 
 
 class State(NamedTuple):
-    """Where the outer loop stands: `found` belongs to `point` and `alpha`; an objective of -inf: nothing found yet."""
+    """The state of the outer loop: `found` belongs to `point` and `alpha`; objective -inf: none
+    found yet."""
 
     point: Point
     alpha: jax.Array  # (M,)
@@ -107,7 +108,7 @@ class MethodTask(Task):
 
 
 class Method(ABC):
-    """What every method inherits: a frozen dataclass of static fields."""
+    """The base of every method: a frozen dataclass of static fields."""
 
     name: ClassVar[str]
     priors: ClassVar[tuple[type, ...]]  # the first is its own
@@ -146,11 +147,12 @@ class Method(ABC):
         return isinstance(prior, self.priors)
 
     def note(self, prior: Prior) -> str:
-        """What the intervals are worth with these settings and a prior."""
+        """A note on the validity of the intervals with these settings and a prior."""
         return self.intervals
 
     def remark(self, prior: Prior) -> str:
-        """What the message of a fit says of the method under a prior; empty where nothing is to be said."""
+        """A remark on the method under a prior for the message of a fit; empty where there is
+        none."""
         return ""
 
     def suited(self, problem: Problem) -> Method:
@@ -191,7 +193,7 @@ class Iterated(Method, ABC):
 
 
 class ParticleSmoother(ABC):
-    """What the core asks of particles."""
+    """The interface that the core requires of particles."""
 
     @abstractmethod
     def task(self, method: Iterated, problem: Problem, prior: Prior, start: Point, context: Context) -> MethodTask:

@@ -87,7 +87,8 @@ def check_problem(problem: Problem, *, linear: bool = True) -> None:
 
 
 def table() -> pd.DataFrame:
-    """Which method (rows, by class) takes which prior (columns, by name on the command line)."""
+    """A table of the priors (columns, by command-line name) that each method (rows, by class)
+    takes."""
     first = {type(method).__name__: method for method, _ in reversed(list(METHODS.values()))}
     known = {name: first[name] for name in dict.fromkeys(type(method).__name__ for method, _ in METHODS.values())}
     rows = {name: ["yes" if one.takes(prior) else "" for prior in PRIORS.values()] for name, one in known.items()}

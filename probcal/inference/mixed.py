@@ -99,7 +99,7 @@ def quantities(draws: Draw, names: Sequence[str], *, hyper: bool) -> tuple[list[
 
 
 def side_of_draws(draws: Draw) -> np.ndarray:
-    """Which side of a mirror each draw (chain, draw) is on, 0 where there is none."""
+    """The index of the mode of each draw (chain, draw), 0 where there is no reflection."""
     return np.asarray(draws.stats.get("side", np.zeros(np.shape(draws.theta)[:2], int)))
 
 

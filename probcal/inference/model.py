@@ -38,7 +38,7 @@ from probcal.types import float64
 
 
 def suffix(problem: Problem, r: int) -> str:
-    """What the sites of recursion r end with: nothing where there is one only."""
+    """The ending of the site names of recursion r: empty where there is only one recursion."""
     return "" if len(problem.epochs) == 1 else f"_{r}"
 
 

@@ -104,7 +104,7 @@ class NUTS(FramedSampler):
         return chain, Sample(found.theta, chain.z.eps, found.phi, found.joint, stats | jumps)
 
     def place(self, form: Form, posed: Posed, chain: Any) -> Place:
-        """Where a chain stands."""
+        """The position of a chain."""
         found = parts(form, posed, chain.z)
         weight = log_weight(posed.model, posed.frame, found.theta, chain.z.eps)
         return Place(found.theta, chain.z.eps, found.phi, weight)

@@ -39,7 +39,7 @@ class Pilot(NamedTuple):
 
 
 class Worth(NamedTuple):
-    """How well a frame stands for the joint posterior."""
+    """The importance diagnostics of a Gaussian reference for the joint posterior."""
 
     khat: float  # Pareto k-hat of the weights of its draws
     acceptance: float  # of a new theta, trajectories held in the frame's coordinates

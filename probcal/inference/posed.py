@@ -101,7 +101,7 @@ def prior_precision(form: Form, posed: Quadratic, phi: Phi) -> tuple[jax.Array, 
 
 
 def activity(form: Form, posed: Quadratic, phi: Phi) -> jax.Array:
-    """Which entries of theta are not exactly zero, (Q,)."""
+    """A mask (Q,) of the entries of theta that are not exactly zero."""
     H = posed.level_spread.shape[0]
     return jnp.concatenate([form.hierarchy.active(phi, form.biases), jnp.ones(H, bool)])
 

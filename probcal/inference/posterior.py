@@ -1,4 +1,5 @@
-"""What the draws of a sampler say: estimates, intervals, gamma, inclusion, how well the chains mixed, in words."""
+"""The summary of a sampler's draws: estimates, intervals, gamma, inclusion, mixing of the chains,
+in words."""
 
 from __future__ import annotations
 
@@ -68,7 +69,7 @@ class SamplerRun:
 
     @property
     def side(self) -> np.ndarray:
-        """Which side of a mirror each draw (chain, draw) is on, 0 where there is none."""
+        """The index of the mode of each draw (chain, draw), 0 where there is no reflection."""
         return side_of_draws(self.draws)
 
     @property
@@ -175,7 +176,7 @@ def heaviest(run: SamplerRun) -> int:
 
 
 def _framed(run: SamplerRun) -> Point:
-    """Where the frame of a run stands."""
+    """The point of the Gaussian reference of a run."""
     assert isinstance(run.posed, Posed)
     return run.posed.frame.point
 
@@ -192,7 +193,8 @@ def mean_point(problem: Problem, run: SamplerRun) -> Point:
 def values_by_datum(
     problem: Problem, run: SamplerRun, key: jax.Array, keep: tuple[str, ...]
 ) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
-    """Which draws (kept,) of each chain have values by datum; log-likelihood and replicas (chain, kept, N, C) there."""
+    """The draws (kept,) of each chain with values by datum; log-likelihood and replicas (chain,
+    kept, N, C) there."""
     chains, draws = run.z.shape[:2]
     most = draws_a_chain(problem.model.size, chains)
     kept = np.unique(np.linspace(0, draws - 1, min(draws, most)).round().astype(int))

@@ -42,14 +42,14 @@ class Blocks(NamedTuple):
 
 
 class BlockChain(NamedTuple):
-    """Where the sweeps of one chain stand."""
+    """The state of the sweeps of one chain."""
 
     z: jax.Array  # (M,)
     phi: Phi
 
 
 class BlocksSwept(NamedTuple):
-    """What sweeps say of cavities times prior."""
+    """The results of sweeps over cavities times prior."""
 
     mean: Any  # (B, p)
     covariance: Any  # (B, p, p)
@@ -204,7 +204,8 @@ class PropagationState(NamedTuple):
 
 @dataclass(eq=False)
 class Propagation(Task):
-    """Where a propagation stands: the likelihood, the sites in the place of the priors, and what both say."""
+    """The state of a propagation: the likelihood, the sites in place of priors, the moments of
+    both."""
 
     form: Form
     first: Precision  # the prior of what no hierarchy governs, which the likelihood counts

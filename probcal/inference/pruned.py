@@ -45,7 +45,8 @@ class GroupEvidence:
         return np.asarray(0.5 * np.sum(np.log(np.asarray(alpha)[..., None] / own) + self.q2 / own, -1))
 
     def share(self, alpha: float, fall: float) -> float:
-        """What part of its squared score is true where the evidence falls by so many nats without it."""
+        """The true fraction of the squared score if the evidence falls by `fall` nats without
+        it."""
         own = alpha + self.s
         promised = 0.5 * np.sum(self.q2 / own)
         return float((fall - 0.5 * np.sum(np.log(alpha / own))) / max(promised, 1e-300))

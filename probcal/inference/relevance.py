@@ -31,7 +31,7 @@ class Relevance:
 
     @property
     def inside(self) -> np.ndarray:
-        """Which biases (M,) are not pruned."""
+        """A mask (M,) of the biases that are not pruned."""
         return self.alpha < PRECISION_BOUNDS[1]
 
     def solve(self) -> None:

@@ -153,7 +153,8 @@ class Maximiser(Iterated, ABC):
         return None if engine.cheap and engine is not self.engine else engine
 
     def lacking(self, prior: Prior, starts: int) -> str:
-        """What such a climb takes in the place of what was asked; empty where it does that."""
+        """The option that such a climb takes instead of the requested one; empty where it takes
+        it."""
         if estimates(self.engine) and not isinstance(prior, (Gaussian, Flat)):
             return "precisions that are given (MAP() with Gaussian() or Flat())"
         if not isinstance(self.climbs_under(prior), (Gaussian, Flat)):
@@ -189,7 +190,7 @@ class Maximiser(Iterated, ABC):
         return prior
 
     def integration(self, problem: Problem, prior: Prior) -> Integration | None:
-        """How the precisions of a prior are integrated after the climb, None where they are not."""
+        """The integration of the precisions after the climb, None where they are not integrated."""
         return None
 
     @abstractmethod
@@ -204,11 +205,11 @@ class Maximiser(Iterated, ABC):
         return self.trajectory == "marginal" and not (prior.learns or model.tailed)
 
     def begin(self, model: Model, start: Point) -> Any:
-        """What is carried to the first iteration: nothing, unless said otherwise."""
+        """The state carried into the first iteration, empty by default."""
         return ()
 
     def close(self, model: Model, prior: Prior, given: Given, state: State) -> State:
-        """What is computed once a chunk."""
+        """The state after the computations that are made once per chunk."""
         return state
 
 

@@ -68,7 +68,7 @@ class Sampler(Method, ABC):
         return self
 
     def instead(self, prior: Prior, fallback: Sampler) -> Sampler | None:
-        """What takes over where the frame does not stand for the posterior; None: this one goes on."""
+        """The sampler that takes over if the Gaussian reference fails; None: this one continues."""
         return None
 
     def first(self, form: Form, posed: Posed, theta: jax.Array, phi: Phi, key: jax.Array) -> Any:
@@ -80,7 +80,7 @@ class Sampler(Method, ABC):
         raise AssertionError(f"a step of {self.name} is no kernel")
 
     def place(self, form: Form, posed: Posed, chain: Any) -> Place:
-        """Where a chain stands; needed of a sampler that crosses."""
+        """The position of a chain; needed of a sampler with mode jumps."""
         raise AssertionError(f"{self.name} does not cross")
 
     def put(self, form: Form, posed: Posed, chain: Any, at: Place) -> Any:

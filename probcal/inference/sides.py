@@ -21,7 +21,7 @@ from probcal.problem import Problem
 
 
 class Sided(NamedTuple):
-    """Where a chain stands that visits several sides of a mirror."""
+    """The state of a chain that visits several modes of a reflection."""
 
     chain: Any
     side: jax.Array  # () which frame it moves in

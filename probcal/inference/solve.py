@@ -278,7 +278,8 @@ def _like_first(
 
 
 def _weight(answer: Answer) -> float:
-    """What sides are compared by: the evidence, or where that is estimated the log marginal density of the biases."""
+    """The score for comparing modes: the evidence, or if that is estimated the log marginal density
+    of the biases."""
     if estimates(getattr(answer.method, "engine", "dense")) and answer.trace is not None:
         return float(answer.trace[-1])
     return answer.objective

@@ -183,7 +183,7 @@ def _local_cluster(batches: int) -> Any:
 
 
 def dask_setup(worker: Any) -> None:
-    """Where a local worker begins dask calls this: Ctrl-C is left to the client, no thread of XLA is waited for."""
+    """Prepares a local dask worker: leaves Ctrl-C to the client, and waits for no thread of XLA."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
 
@@ -205,7 +205,7 @@ def _check_answer(address: str) -> None:
 
 
 class _Here(NamedTuple):
-    """What workers must have in common with this process."""
+    """The versions and settings that workers must have in common with this process."""
 
     versions: dict[str, str]
     kernels: dict[str, Any]  # settings of jax

@@ -134,7 +134,7 @@ class Storage:
         return " and every later chunk" if self.kind == "draws" else ""
 
     def _mark(self, number: int) -> str:
-        """What the file of a part says of itself."""
+        """The mark in the file of a part, which identifies it."""
         return f"{KINDS[self.kind]} {number} of {self.digest}"
 
     def _file(self, number: int) -> Path:

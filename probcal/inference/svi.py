@@ -29,7 +29,7 @@ SMOOTH = 0.95  # of the running bound
 
 
 class Optimisation(NamedTuple):
-    """Where one optimisation stands."""
+    """The state of one optimisation."""
 
     fitted: GuideParameters
     slope: GuideParameters  # running mean of the gradients
@@ -138,7 +138,7 @@ class SVI(FramedSampler):
         return Structured(sum(leaf.size for leaf in jax.tree.leaves(free)) - sum(e.size for e in free.eps))
 
     def drawn(self, form: Form, posed: Posed, free: Free) -> tuple[Sample, jax.Array]:
-        """What coordinates stand for, and their log density up to a constant."""
+        """The sample that coordinates represent, and their log density up to a constant."""
         found = parts(form, posed, free)
         return Sample(found.theta, free.eps, found.phi, found.joint, {}), found.density
 
@@ -162,13 +162,14 @@ class SVI(FramedSampler):
         return density
 
     def _sample(self, form: Form, posed: Posed, x: jax.Array) -> tuple[Sample, jax.Array]:
-        """What flat coordinates stand for, and their log density."""
+        """The sample that flat coordinates represent, and their log density."""
         sample, density = self.drawn(form, posed, ravel_pytree(self.template(form, posed))[1](x))
         return sample, density + _constant(form, posed, sample.phi)
 
 
 def _constant(form: Form, posed: Posed, phi: Phi) -> jax.Array:
-    """What the log densities of theta and of the noises leave out: with it the bound is one of the log evidence.
+    """The constant that the log densities of theta and the noises omit: with it the bound is one of
+    the log evidence.
 
     A flat prior counts as one.
     """

@@ -42,7 +42,7 @@ def _one(kind: SensorType, places: Places, state: jax.Array, poses: Any, biases:
 
 
 class StateMapping:
-    """Which entries of a state vector of `size` numbers are position, velocity and further components.
+    """The indices of position, velocity and further components in a state vector of `size` numbers.
 
     By default those of Stone Soup: position and velocity of each axis in turn. A sequence names the positions alone.
     """
@@ -134,7 +134,7 @@ def channel_stds(placed: Sensor, network: Network, calibration: Calibration) -> 
 
 
 class SensorFunction:
-    """What a placed sensor measures of a state vector, with the poses and biases of a calibration.
+    """The measurement function of a placed sensor, with the poses and biases of a calibration.
 
     Values are in the units of the channels, as the function returns them. A sensor whose node moves, or whose bias
     drifts, has another pose at every time (`varies`).

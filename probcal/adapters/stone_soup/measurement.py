@@ -126,7 +126,7 @@ class ModelMaker:
 
 
 def angle_factor(channel: Channel) -> float:
-    """What takes a channel to the unit of Stone Soup: radians where it wraps."""
+    """The factor that converts a channel to the unit of Stone Soup: radians where it wraps."""
     return 2 * np.pi / channel.period if channel.period else 1.0
 
 

@@ -71,7 +71,7 @@ def _native_sensor(placed: Sensor, maker: ModelMaker) -> Any:
 
 
 def _makers(maker: ModelMaker, placed: Sensor) -> list[tuple[tuple[str, ...], Callable[[np.ndarray], Any]]]:
-    """What each type of Stone Soup measures, and how it is made with a noise covariance."""
+    """The channels of each Stone Soup sensor type, and its maker from a noise covariance."""
     radar = stonesoup("sensor.radar.radar")
     place = _pose(placed, maker) | {"ndim_state": maker.mapping.size}
     mapped = place | {"position_mapping": maker.mapping.position}

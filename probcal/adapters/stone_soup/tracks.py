@@ -56,7 +56,7 @@ def to_tracks(tree: xr.DataTree, *, start: datetime | None = None, mapping: Mapp
 
 
 def _order(components: list[str], mapping: Mapped) -> list[int]:
-    """Where each entry of a Stone Soup state stands among the components of a fit."""
+    """The index of each entry of a Stone Soup state among the components of a fit."""
     dimension = sum(name in POSITION for name in components)
     if mapping is not None:
         entries = StateMapping(mapping, dimension).entries
