@@ -294,7 +294,7 @@ def read_network(path: AnyPath, network: Network) -> dict[str, tuple[float, floa
 
 
 class _Record(NamedTuple):
-    """What is to be written of one node: name, position (d,), components, and spreads or sds by column name."""
+    """The data to write for a node: name, position (d,), components, spreads or sds by column."""
 
     name: str
     position: np.ndarray

@@ -242,11 +242,11 @@ class Family:
         return self.sample(key, predicted, std)
 
     def reported(self, y):
-        """What a sensor writes of what reaches it, NaN where it writes nothing; all of it here."""
+        """The values written of those that reach the sensor, NaN if not written; here all."""
         return y
 
     def check(self, y):
-        """Which values are legal: all."""
+        """The mask of the legal values: all."""
         return np.ones(y.shape, bool)
 
 
@@ -258,7 +258,7 @@ def _derivative(function: Callable[[Any], Any], at: Any) -> Any:
 
 @runtime_checkable
 class ScaleMixture(Protocol):
-    """What a family answers that drives a motion: a vector u (size,) is N(0, I / w), its precision w drawn anew.
+    """The protocol of a family that drives a motion: u (size,) is N(0, I / w), w drawn anew.
 
     `square` is |u|^2 (or what is expected of it), `size` the number of entries; arrays of one shape.
     """
@@ -549,7 +549,7 @@ class Growing(Family):
         return self.noise.reported(y)
 
     def check(self, y):
-        """Which values are legal: all."""
+        """The mask of the legal values: all."""
         return self.noise.check(y)
 
     def square(self, y, predicted, std):
@@ -896,7 +896,7 @@ class Censored(Heard):
         return np.maximum(y, self.known())
 
     def _below(self, predicted, std):
-        """How far in std the floor lies above the predicted value."""
+        """The height of the floor above the predicted value, in std."""
         return (self.known() - predicted) / std
 
     def innovation(self, y, predicted, period):
@@ -944,7 +944,7 @@ class Truncated(Heard):
         return np.where(y > self.known(), y, np.nan)
 
     def _above(self, predicted, std):
-        """How far in std the predicted value lies above the floor."""
+        """The height of the predicted value above the floor, in std."""
         return (predicted - self.known()) / std
 
     def log_likelihood(self, y, predicted, std, period):
@@ -966,7 +966,7 @@ class Truncated(Heard):
         return predicted + std * jnp.where(u < -FAR, far, near)
 
     def check(self, y):
-        """Which values are legal: those above the floor."""
+        """The mask of the legal values: those above the floor."""
         return y > self.known()
 
 
@@ -995,5 +995,5 @@ class Bernoulli(Family):
         return jax.random.bernoulli(key, jax.nn.sigmoid(predicted)).astype(predicted.dtype)
 
     def check(self, y):
-        """Which values are legal: 0 and 1."""
+        """The mask of the legal values: 0 and 1."""
         return (y == 0) | (y == 1)

@@ -54,7 +54,7 @@ class Precision(NamedTuple):
         return self._added(jnp.diag(self.alpha))
 
     def coupled(self) -> jax.Array:
-        """What correlations add to diag(alpha), (M, M)."""
+        """The term (M, M) that correlations add to diag(alpha)."""
         M = self.alpha.shape[0]
         return self._added(jnp.zeros((M, M)))
 
@@ -86,7 +86,7 @@ class Precision(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Prior:
-    """What every prior is and has: a method takes it by what it can do."""
+    """The base of every prior: a method accepts a prior by its capabilities."""
 
     correlation: Any = ()
     kinds: Any = ()
@@ -203,7 +203,7 @@ class Prior:
         return found
 
     def groups(self, members: Members) -> np.ndarray:
-        """Which precision governs each bias, (M,)."""
+        """The index (M,) of the precision that governs each bias."""
         return np.arange(len(members))
 
     def penalty(self, z: Any, alpha: Any) -> Any:
@@ -297,7 +297,7 @@ class ARD(Prior):
         check_by("ARD", self.by)
 
     def groups(self, members: Members) -> np.ndarray:
-        """Which precision governs each bias, (M,)."""
+        """The index (M,) of the precision that governs each bias."""
         return grouped(members, self.by)
 
     def log_hyper(self, alpha: jax.Array, group: jax.Array) -> jax.Array:
@@ -344,7 +344,7 @@ class Horseshoe(Prior):
         check_by("Horseshoe", self.by)
 
     def groups(self, members: Members) -> np.ndarray:
-        """Which local scale governs each bias, (M,)."""
+        """The index (M,) of the local scale that governs each bias."""
         return grouped(members, self.by)
 
     def adaptive(self) -> "Horseshoe":

@@ -192,7 +192,7 @@ class Problem:
 
     @property
     def members(self) -> list[dict[str, str]]:
-        """What each free bias belongs to: its owner, node(s), sensor type(s), component, and vector of axes."""
+        """The owner, node(s), sensor type(s), component and vector of axes of each free bias."""
         found = []
         readers: dict[str, list[Sensor]] = {}
         for s in self.network.sensors:
@@ -748,7 +748,8 @@ class Problem:
             raise InputError(f'{where}: time {time[outside[0]]:g} is outside the path of node "{node.name}"')
 
     def _local(self, block: Block, ours: list[int]) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
-        """Which biases the sensors of a block read: arrays (S, p) by the names of `Rows`, a sensor once for each piece.
+        """The biases that the sensors of a block read: arrays (S, p) by the names of `Rows`, a
+        sensor once per piece.
 
         And the start of each sensor's pieces: between two of them its drifting biases are constant.
         """

@@ -22,6 +22,6 @@ def multinomial(key: jax.Array, log_weights: jax.Array, count: int) -> jax.Array
 
 
 def chosen_at(log_weights: jax.Array, places: jax.Array) -> jax.Array:
-    """Which particle stands at places in [0, 1) of the cumulative weights."""
+    """The indices of the particles at places in [0, 1) of the cumulative weights."""
     cumulative = jnp.cumsum(jax.nn.softmax(log_weights))
     return jnp.searchsorted(cumulative, places * cumulative[-1], side="right").clip(0, len(log_weights) - 1).astype(int)

@@ -51,7 +51,8 @@ def _check_unit(kind: str, unit: Any) -> None:
 
 @dataclass(frozen=True)
 class Drift:
-    """How a bias changes: constant from each of the `times` (T,) to the next, the first also before it.
+    """The drift of a bias: constant from each of the `times` (T,) to the next, the first also
+    before it.
 
     `times` are seconds of the table (of its first row on, where the table has dates).
 
@@ -217,7 +218,8 @@ class SensorType:
 
     @cached_property
     def fingerprint(self) -> str:
-        """What the type computes and declares: types of equal fingerprint are equal and share compiled kernels.
+        """The digest of the type's function and declarations: types of equal digest are equal and
+        share compiled kernels.
 
         It covers the operations and constants of the function, its channels and biases. Raises `InputError` where the
         function computes something else at every call.

@@ -62,7 +62,7 @@ def derived_keys(key: jax.Array, numbers: Sequence[int] = (0, 1)) -> list[jax.Ar
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What is known of the truth: tracks (columns time, [target], position_x, ...) and biases by label.
+    """The known truth: tracks (columns time, [target], position_x, ...) and biases by label.
 
     `tracks` is a path or a DataFrame, in s and m where its headers state no unit; without a column target it is the
     track of a single one. Raises `InputError` naming file, row and column.
@@ -319,7 +319,7 @@ def _detections(
 def _drawn(
     block: rows.Block, data: rows.Rows, states: jax.Array, z: jax.Array, levels: jax.Array, key: jax.Array
 ) -> jax.Array:
-    """What reaches the sensors of a block (N, C), drawn around what they predict."""
+    """The values (N, C) that reach the sensors of a block, drawn around the predicted ones."""
     return rows.sample(block, data, rows.predict(block, data, states, z), levels, key, "emit")
 
 
@@ -362,7 +362,7 @@ def _biases(problem: Problem, share: float, given: Mapping[str, float] | None, k
 
 
 def _states(problem: Problem, r: int, tracks: Mapping[str, Any], key: jax.Array) -> np.ndarray:
-    """What rows read of the states (E, n) of one recursion: drawn from the motion, given components put over."""
+    """The vectors (E, n) that rows read: drawn from the motion, with given components inserted."""
     part, epochs = problem.model.recursions[r], problem.epochs[r]
     noise = np.asarray(problem.model.draw_noises(key, r, 1))[:, :, 0]
     F, L, drift = (np.asarray(a) for a in (part.F, part.L, part.drift))
@@ -433,7 +433,7 @@ def _frame(track: Any, dimension: int, epochs: int, name: str) -> pd.DataFrame:
 def _spoil(
     block: rows.Block, data: rows.Rows, value: np.ndarray, share: float, scale: float, key: jax.Array
 ) -> np.ndarray:
-    """What sensors report, outliers put on a share of it: more noise, or the wrong answer of a yes-or-no channel."""
+    """The sensor reports, a fraction as outliers: more noise, or a wrong yes-or-no answer."""
     pick, size = jax.random.split(key)
     hit = _random(jax.random.uniform, pick, value.shape) < share
     extra = scale * np.asarray(data.std) * _random(jax.random.normal, size, value.shape)

@@ -1,4 +1,4 @@
-"""How a fit ended: one enumeration for all methods, and the rules that decide."""
+"""The status of a fit: one enumeration for all methods, and the rules that decide."""
 
 from collections.abc import Mapping, Sequence
 from enum import StrEnum

@@ -465,7 +465,7 @@ def _check_limits(table: Table, name: str, channel: Channel, value: np.ndarray, 
 
 
 def unit_factor(table: Table, name: str, unit: str | None, wanted: str) -> float:
-    """What takes a column from its unit (None: already there) to the wanted one; raises `InputError`."""
+    """The factor from a column's unit (None: no change) to the wanted one; raises `InputError`."""
     if unit is None or unit == wanted:
         return 1.0
     if wanted not in UNITS:

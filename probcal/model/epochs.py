@@ -24,7 +24,9 @@ State = tuple[Any, ...]  # (T, n) of each recursion, or a pytree with T leading
 
 
 class Move(NamedTuple):
-    """How the state of one target reaches an epoch: x = F x + drift + L u, u ~ N(0, I) times the unknown levels."""
+    """The step of one target's state to an epoch: x = F x + drift + L u, u ~ N(0, I) times unknown
+    levels.
+    """
 
     F: jax.Array  # (n, n), 0 at the first epoch of a target
     L: jax.Array  # (n, n)
@@ -61,7 +63,7 @@ class Epoch(NamedTuple):
 
 
 class Stepwise(Loops):
-    """What a `Model` computes at one epoch."""
+    """The computations of a `Model` at one epoch."""
 
     blocks: tuple[Block, ...]
     recursion: tuple[int, ...]
@@ -227,12 +229,12 @@ class Stepwise(Loops):
         return found
 
     def vectors(self, r: int, states: Any) -> jax.Array:
-        """What rows read of states of recursion r, (E, n): the states themselves where the motion is linear."""
+        """The vectors (E, n) that rows read in recursion r: the states if the motion is linear."""
         form = self.sampled[r]
         return states if form is None else jax.vmap(form.vector)(states)
 
     def vectors_of(self, states: tuple[Any, ...]) -> States:
-        """What rows read of the states of each recursion, (E, n)."""
+        """The vectors (E, n) that rows read from the states of each recursion."""
         return tuple(map(self.vectors, range(len(states)), states))
 
     def check_linear(self) -> None:

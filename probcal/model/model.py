@@ -28,7 +28,7 @@ Mixing = tuple[tuple[jax.Array, ...], ...]  # weight (E,) of each tail of each r
 
 
 class Where(Protocol):
-    """What a model is evaluated at: a `Point`, or `At`."""
+    """The point at which a model is evaluated: a `Point`, or `At`."""
 
     @property
     def states(self) -> tuple[Any, ...]:
@@ -97,7 +97,7 @@ class Tilt(NamedTuple):
         return cls(zero, np.zeros(()), zero, np.zeros((biases,) * (2 if biases <= TILTED else 1)))
 
     def value(self, z: Any) -> Any:
-        """What is added at z."""
+        """The value that is added at z."""
         moved = z - self.at
         return self.height + moved @ (self.slope - 0.5 * self.times(moved))
 
@@ -142,7 +142,7 @@ class Recursion(NamedTuple):
 
 
 def at_rest(part: Recursion, targets: int) -> np.ndarray:
-    """Which of so many targets (T,) of a recursion never leave a first place that is not known."""
+    """The mask (T,) of this many targets of a recursion: True if static at an unknown place."""
     E, n = part.drift.shape
     if not E or part.tails:
         return np.zeros(targets, bool)
@@ -196,7 +196,7 @@ class Model(Stepwise):
         return self._at(waist.square, at)
 
     def reliance(self, at: Where) -> Data:
-        """How much each datum counts against one that fits: 1 inlying, towards 0 outlying."""
+        """The weight of each datum relative to one that fits: 1 inlying, towards 0 outlying."""
         return self._at(waist.reliance, at)
 
     def information(self, at: Where) -> Data:
@@ -389,7 +389,7 @@ class Model(Stepwise):
         return total
 
     def by_sensor(self, biases: jax.Array) -> Data:
-        """What (M, ...) says of the biases that each sensor of each block reads, (S, p, ...); 0 of fixed ones."""
+        """The entries (S, p, ...) of (M, ...) per block: the biases of each sensor; 0 if fixed."""
         padded = jnp.concatenate([biases, jnp.zeros((1, *biases.shape[1:]), biases.dtype)])
         return tuple(padded[data.bias] for data in self.rows)
 
@@ -405,7 +405,7 @@ class Model(Stepwise):
 
     @property
     def read(self) -> tuple[np.ndarray, ...]:
-        """Which biases each row reads, (N, p) of each block; M where it is fixed or none."""
+        """The indices of the biases that each row reads, (N, p) per block; M if fixed or none."""
         return tuple(np.asarray(data.bias)[np.asarray(data.sensor)] for data in self.rows)
 
     @property

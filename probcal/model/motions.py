@@ -24,7 +24,7 @@ CLEAR = 5.0
 
 
 class Area(NamedTuple):
-    """Where a target starts of which nothing is stated."""
+    """The area in which a target starts if nothing is stated about it."""
 
     dimension: int
     centre: np.ndarray  # (d,)
@@ -143,7 +143,7 @@ def by_component(components: tuple[Any, ...], d: int) -> list[tuple[Any, slice, 
 
 
 def form_of(name: str, motion: Motion, levels: Levels, d: int) -> tuple[Layout, SampledMotion | None]:
-    """What rows read of a target's state in d axes, and the static form of a motion that is not linear."""
+    """The layout of a target's state in d axes, and the static form of a nonlinear motion."""
     others = motion.split[1]
     if not others:
         return layout_of(linear_of(motion), d), None

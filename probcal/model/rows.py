@@ -43,7 +43,7 @@ class Parameter(NamedTuple):
 
 @dataclass(frozen=True)
 class Block:
-    """What a block of rows computes; hashable, so that one compiled kernel serves all data of this form."""
+    """The computation of a block of rows; hashable: one kernel serves all data of its form."""
 
     type: SensorType
     layout: Layout  # state components (name, start, stop, per axis)
@@ -496,7 +496,7 @@ def linearise(
 def _linearised(
     block: Block, rows: Rows, states: jax.Array, z: jax.Array, levels: jax.Array, *, expected: Any
 ) -> Linearised:
-    """What `linearise` gives of some rows."""
+    """The result of `linearise` for some rows."""
     local = read_biases(block, rows, z)
     reached = states[rows.epoch]
 
@@ -607,7 +607,7 @@ def slopes(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) ->
 
 
 def reliance(block: Block, rows: Rows, predicted: jax.Array, levels: jax.Array) -> jax.Array:
-    """How much each datum counts against one that fits: 1 inlying, towards 0 outlying, (N, C)."""
+    """The weight (N, C) of each datum relative to one that fits: 1 inlying, towards 0 outlying."""
     return _measured(block, rows, "reliance", predicted, levels)
 
 

@@ -24,7 +24,7 @@ from probcal.types import untraceable
 
 @dataclass(frozen=True, eq=False)
 class SampledMotion:
-    """What the targets of one recursion do beyond a linear motion; a state x is that of the `motion` as declared."""
+    """The nonlinear motion of one recursion's targets; x is a state of the declared `motion`."""
 
     motion: Motion
     layout: Layout  # of `vector(x)`: what is linear, then what the others show
@@ -72,7 +72,7 @@ class SampledMotion:
         return others if self.motion.vector is None else (vector, *others)
 
     def vector(self, x: Any) -> jax.Array:
-        """What rows read of a state: (n,) as the layout says."""
+        """The vector (n,) that rows read from a state, in the order of the layout."""
         linear, others = self.part(x)
         shown = [other.view(own) for other, own in zip(self.others, others, strict=True)]
         parts = [jnp.atleast_1d(jnp.asarray(own[name], float)) for own in shown for name in sorted(own)]

@@ -85,7 +85,7 @@ def crossed_nodes(problem: Problem, point: Point, most: float = np.inf) -> Itera
 def _starts(
     problem: Problem, z: np.ndarray, place: np.ndarray, members: list[int], plane: Plane
 ) -> list[np.ndarray]:  # fmt: skip
-    """Where a node at `place` (d,) may stand beside a plane, by its free axes: biases z, the other side first.
+    """The starts z of a node at `place` (d,) near a plane, by its free axes, the reflection first.
 
     None where these axes do not lead there, or it lies `FAR` scales off. A path is a plane by least squares only: how
     exactly a node is reflected does not matter, since it settles there.
@@ -102,7 +102,7 @@ def _starts(
 
 @dataclass(frozen=True)
 class _Own:
-    """Which biases and which data are those of one node alone, of K nodes."""
+    """The biases and the data that belong to one node alone, for each of K nodes."""
 
     biases: np.ndarray  # (K, P), M of none
     nodes: list[np.ndarray]  # of each block the nodes (N, p) of the sensor of each row, -1 of none

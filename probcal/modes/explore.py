@@ -62,7 +62,7 @@ class Mirrored(NamedTuple):
 
 
 class SideClimb(NamedTuple):
-    """How the mode next to a point under the declared scales is found and weighed."""
+    """The functions that find and weigh the mode next to a point under the declared scales."""
 
     mode: Callable[[Point], tuple[Point, float]]  # the mode, and its log density or evidence, -inf where there is none
     evidence: Callable[[Point, float], float]  # of a mode and what came with it
@@ -100,7 +100,7 @@ Proposal = Callable[[Problem, Point, float], Iterator[Candidate]]
 
 
 class Sides(NamedTuple):
-    """What a search found."""
+    """The result of a search."""
 
     point: Point  # the best place
     moved: bool  # whether it is another than the given one
@@ -243,7 +243,7 @@ def _ranked(here: _Here, near: Sequence[_Tried]) -> list[Mirrored]:
 
 
 def distance(problem: Problem, a: Point, b: Point) -> Gap:
-    """What lies between the places of two points."""
+    """The distances between two points, over their targets and over their nodes."""
     away = problem.positions(jax.tree.map(np.subtract, a.states, b.states))
     own = [m for members in place_biases(problem).values() for m in members]
     moved = (np.asarray(a.z) - np.asarray(b.z))[own]

@@ -26,7 +26,9 @@ STEP = 0.1  # by which a bias is moved to see whether it turns or shifts a chann
 
 
 class Kind(NamedTuple):
-    """What a channel measures: `sign` times the geometry plus `shift`; `by` is what each own bias adds, per unit."""
+    """The measurement of a channel: `sign` times the geometry plus `shift`; `by` is the effect per
+    unit of each own bias.
+    """
 
     family: str  # "azimuth", "elevation"
     sign: float
@@ -108,7 +110,9 @@ def _family(value: np.ndarray, other: np.ndarray, shape: np.ndarray, wraps: bool
 
 
 class Directions(NamedTuple):
-    """What one resting node sees of one target: times (N,), azimuths (N,) or azimuths and elevations (N, 2), stds."""
+    """The directions of one target from one static node: times (N,), azimuths (N,) or azimuths and
+    elevations (N, 2), stds.
+    """
 
     node: str
     target: str

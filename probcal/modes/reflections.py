@@ -58,7 +58,7 @@ def planes(problem: Problem, z: np.ndarray) -> list[Plane]:
 
 
 def touched(problem: Problem, point: Point, variances: Sequence[np.ndarray]) -> tuple[float, str]:
-    """How near in sd a target comes to a plane of the nodes, at the least, and in words which, when and where.
+    """The least distance in sd of a target from a plane of the nodes, and which, when and where.
 
     `variances` are those (E, n) of the states of each recursion. On the plane the data do not tell how far off it a
     target is, nor on which side it goes on: an approximation by a Gaussian around one track says too little there.
@@ -112,7 +112,7 @@ def node_places(problem: Problem, z: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def place_biases(problem: Problem) -> dict[str, list[int]]:
-    """Which biases are those of the place of each resting node that has some, by name."""
+    """The position biases of each static node that has any, by its name."""
     resting = {node.name for node in problem.network.nodes if node.path is None}
     found: dict[str, list[int]] = {}
     for m, bias in enumerate(problem.biases):

@@ -1,4 +1,4 @@
-"""What a motion is: the protocol `Motion`, and the `Component` of which linear ones are composed with `+`.
+"""The protocol `Motion` of all motions, and the `Component` that linear ones compose with `+`.
 
 To add a linear motion, write a frozen dataclass that inherits `Component`. To add another, whose state may be any
 pytree (a road: edge, arc length, speed), write one that inherits `Motion`.
@@ -34,7 +34,7 @@ class Linear(NamedTuple):
 
 
 class Motion(ABC):
-    """How a target moves: what filters ask of it, for one target at a time. `a + b` puts two side by side.
+    """The motion of one target: the functions that filters call. `a + b` puts two side by side.
 
     The state is a pytree of arrays with the same shapes at all times. `dt` is () in s, and `levels` maps each name in
     `self.levels` to its value. `linear`, `log_density` and `log_initial` are capabilities: Gaussian methods ask for
@@ -375,7 +375,7 @@ def _joined(*motions: Motion) -> Motion:
 
 
 def level_name(component: Any) -> str:
-    """What the noise level of a component is called."""
+    """The name of the noise level of a component."""
     return component.level if getattr(component, "stationary", False) else f"{component.driven}_std"
 
 

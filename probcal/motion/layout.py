@@ -1,4 +1,4 @@
-"""Where the components of a state stand in a vector, by name, and the vector of a start."""
+"""The slices of the components of a state in a vector, by name, and the vector of a start."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ CROWD = 500  # least particles of the pass that a conditional filter begins with
 
 
 class Climb(NamedTuple):
-    """Where the loop stands."""
+    """The state of the loop."""
 
     z: jax.Array  # (M,)
     levels: jax.Array  # (H,)
@@ -242,7 +242,7 @@ def _beginning(
 
 
 def _moved(problem: Problem, still: Wandering) -> str:
-    """What still moves, in words."""
+    """Describes the bias that has not converged, in words."""
     if not np.isfinite(still.moved):
         return "too few iterations to tell whether they settled"
     return f"{problem.labels[still.worst]} still moves by {still.moved:.2g} sd in {WINDOW} iterations"

@@ -41,7 +41,7 @@ class Ensemble(NamedTuple):
 
 
 class StateMoments(NamedTuple):
-    """What rows see of the states of one recursion."""
+    """The moments of the vectors that rows read from the states of one recursion."""
 
     mean: jax.Array  # (E, n)
     variance: jax.Array  # (E, n)
@@ -137,7 +137,7 @@ def _by_target(targets: tuple[Targets, ...], states: tuple[Any, ...]) -> tuple[A
 
 @jax.jit
 def vectors_of(model: Model, states: tuple[Any, ...]) -> tuple[jax.Array, ...]:
-    """What rows see of particles (E, N leading) of each recursion, (E, N, n)."""
+    """The vectors (E, N, n) that rows read from particles (E, N leading) of each recursion."""
     return jax.vmap(model.vectors_of, 1, 1)(states)
 
 

@@ -15,7 +15,7 @@ from probcal.resampling import systematic
 
 
 class FilteredParticles(NamedTuple):
-    """What a filter leaves of each of K epochs: M particles as they were drawn, before they are resampled."""
+    """The output of a filter for each of K epochs: M particles as drawn, before resampling."""
 
     states: State  # (K, M) leading
     log_weights: jax.Array  # (K, M) normalised

@@ -51,7 +51,7 @@ CONDITIONAL = Particles(100)
 
 
 class GibbsState(NamedTuple):
-    """Where a chain stands."""
+    """The state of a chain."""
 
     theta: jax.Array  # (Q,) biases, log levels
     phi: Phi
@@ -60,7 +60,7 @@ class GibbsState(NamedTuple):
 
 
 class Held(NamedTuple):
-    """What stays the same in all sweeps."""
+    """The quantities that stay the same in all sweeps."""
 
     model: Model
     targets: tuple[Targets, ...]

@@ -1,4 +1,4 @@
-"""How a particle is moved to an epoch, and the log weight that it gains there."""
+"""The proposals that move a particle to an epoch, and the log weight that it gains there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How particles are drawn, weighed and smoothed."""
+"""The settings by which particles are drawn, weighed and smoothed."""
 
 from __future__ import annotations
 

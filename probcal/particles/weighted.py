@@ -86,7 +86,7 @@ def check_learnt(problem: Problem) -> None:
 
 
 class Ended(NamedTuple):
-    """Where a climb by particles ended."""
+    """The result of a climb by particles."""
 
     z: jax.Array  # (M,)
     levels: jax.Array  # (H,)
@@ -98,7 +98,7 @@ class Ended(NamedTuple):
 
 
 class DrawnTracks(NamedTuple):
-    """What particles say of all states over draws of the biases."""
+    """The particle estimates of all states over draws of the biases."""
 
     z: np.ndarray  # (D, M)
     tracks: list[Tracks]  # of each recursion
@@ -124,7 +124,7 @@ class Paths:
         return replace(self, how=replace(self.how, smoother="backward"))
 
     def seen(self, found: Ensemble) -> list[jax.Array]:
-        """What rows see of the states, (E, N, n) of each recursion."""
+        """The vectors (E, N, n) that rows read from the states of each recursion."""
         return list(vectors_of(self.problem.model, found.states))
 
     def over(self, z: np.ndarray, levels: np.ndarray, key: jax.Array) -> DrawnTracks:
@@ -177,7 +177,7 @@ def draw_ensemble(own: Posterior, key: jax.Array, keep: tuple[str, ...], paths: 
 
 
 class Louis(NamedTuple):
-    """What some filters and smoothers say of the biases at a place, pooled by their likelihoods."""
+    """The information about biases at a place from several filters, pooled by their likelihoods."""
 
     information: np.ndarray  # (M, M) of the data, trajectories integrated
     score: np.ndarray  # (M,) of the log-likelihood by the biases
@@ -335,7 +335,7 @@ def conclude_particles(
 
 
 def steepness(slope: np.ndarray, covariance: np.ndarray, noise: np.ndarray) -> float:
-    """How far a Newton step would go in sd per bias, less the noise of the slope: on average, or half the largest."""
+    """The Newton step in sd per bias, less the slope's noise: the average or half the largest."""
     if not len(slope):
         return 0.0
     step, sd = covariance @ slope, np.sqrt(np.maximum(np.diag(covariance), 1e-300))

@@ -1,4 +1,4 @@
-"""What all pictures share: colours, limits, plain texts, axes without pyplot, their labels and legends."""
+"""The shared parts of pictures: colours, limits, texts, axes without pyplot, labels, legends."""
 
 import io
 from collections.abc import Iterable, Sequence

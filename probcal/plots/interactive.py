@@ -107,7 +107,7 @@ def _sources(tree: xr.DataTree, shown: Scene) -> dict[str, ColumnDataSource]:
 
 
 def _words(tree: xr.DataTree, shown: Scene) -> Iterator[str]:
-    """What the map says of each node: where it is, and its biases and those of its sensors."""
+    """The map's text on each node: its position, its biases and those of its sensors."""
     constant, said = tree["constant_data"].to_dataset(), dict[str, list[str]]()
     for row in frame_of(tree, "calibration", "owner", "mean", "sd", "unit").itertuples():
         value = f"{row.mean:.4g} ± {row.sd:.2g} {'' if row.unit == '1' else row.unit}".rstrip()
@@ -162,7 +162,7 @@ def _panel(shown: Scene, sources: dict[str, ColumnDataSource], axes: tuple[int, 
 
 
 def _draw_views(sheet: figure, views: list[Outline]) -> None:
-    """Where the view of each sensor ends; filled where one line goes round it."""
+    """Draws the limit of the view of each sensor; filled if one line goes round it."""
     lines = [
         (*line.T, colour(k), 0.05 if own.whole else 0.0, own.sensor)
         for k, own in enumerate(views)

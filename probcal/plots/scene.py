@@ -1,4 +1,4 @@
-"""What a map shows: nodes as stated and as calibrated, tracks without and with calibration, the truth, a mirror.
+"""The content of a map: nodes and tracks before and after calibration, the truth, a reflected mode.
 
 Of detections that nobody named also the objects found, and what each sensor sees.
 """
@@ -56,7 +56,7 @@ def thinned[T: (Track, Found)](whole: T, most: int) -> T:
 
 @dataclass(frozen=True)
 class Outline:
-    """Where the view of one sensor ends in the plane: lines (P, 2) in m; `whole` where a single one goes round it."""
+    """The limit of a sensor's view in the plane: lines (P, 2) in m; `whole` if one encloses it."""
 
     sensor: str
     lines: list[np.ndarray]
@@ -77,7 +77,7 @@ class Places:
 
     @property
     def named(self) -> np.ndarray:
-        """Where the name of each node stands (N, d): as stated, as calibrated where several are stated at one place."""
+        """The place (N, d) of each node's name: as stated, or calibrated if several share it."""
         _, place, count = np.unique(self.stated, axis=0, return_inverse=True, return_counts=True)
         return np.where((count[place] > 1)[:, None], self.calibrated, self.stated)
 
@@ -190,7 +190,7 @@ def _mirrored(tree: xr.DataTree, others: xr.Dataset) -> Iterator[Track]:
 
 
 def _views(tree: xr.DataTree, nodes: Places, far: float) -> Iterator[Outline]:
-    """What each sensor sees from its calibrated node, in the plane; a view without an end ends `far` m away."""
+    """The plane view of each sensor from its calibrated node; unlimited ones end at `far` m."""
     group = tree["constant_data"].to_dataset()
     if "view_range" not in group:
         return

@@ -12,7 +12,7 @@ from probcal.plots.scene import scene
 
 
 class Chart(NamedTuple):
-    """What a page needs to show the map."""
+    """The data that a page needs to show the map."""
 
     data: str  # JSON that may stand in a page
     layers: dict[str, str]  # tags and what they are called

@@ -117,7 +117,7 @@ def _judged(tree: xr.DataTree) -> str:
 
 
 def nothing_found(tree: xr.DataTree) -> str:
-    """What it means that no bias is shown: how many the data tell of, or that nobody asked."""
+    """The reason that no bias is shown: how many the data determine, or a fit not assessed."""
     verdicts = listed_in(tree, "verdict", "verdict")
     told = f"the data determine {verdicts.count('determined')} of {len(verdicts)}"
     return f"; {told if verdicts else 'the fit was not assessed'}"

@@ -43,7 +43,7 @@ class Accessor:
         return drift_table(self._tree)
 
     def scores(self, truth: Truth, *, align: str | None = None) -> dict[str, float]:
-        """What a truth says of the tree, as `probcal.scores`."""
+        """Scores the tree by a truth, as `probcal.scores`."""
         from probcal.results.scores import scores
 
         return scores(self._tree, truth, align=align)

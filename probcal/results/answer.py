@@ -37,13 +37,13 @@ HALF = NormalDist().inv_cdf(0.5 + INTERVAL / 2)  # sds from the mean to an end o
 
 
 class Named(Protocol):
-    """What an answer says of a method."""
+    """The description of a method in an answer."""
 
     name: ClassVar[str]
     chooses: ClassVar[bool]
 
     def note(self, prior: Prior) -> str:
-        """What the intervals are worth under a prior."""
+        """Describes the validity of the intervals under a prior."""
 
 
 class Draws(NamedTuple):
@@ -66,7 +66,7 @@ class Tracks(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """What an answer says of each bias, z over its scale, in the order of `problem.labels`."""
+    """The summary of each bias, in units of its scale and in the order of `problem.labels`."""
 
     kind: str  # "Laplace", "mixture", "exact" or "variational"
     precisions: str  # of the prior: "given", "maximised", "integrated" or "sampled"
@@ -264,7 +264,7 @@ def tracks_at(point: Point, variances: Sequence[Any]) -> list[Tracks]:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What a method found for a problem, what was asked for and what ran, and how it ended."""
+    """The result of a method for a problem, with the request, what ran, and the status."""
 
     problem: Problem  # that was solved; without motion for weighted least squares
     method: Named  # that ran

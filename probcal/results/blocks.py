@@ -126,7 +126,7 @@ class SensorBlocks(NamedTuple):
         return found[:-1, :-1]
 
     def under_scales(self) -> SensorBlocks:
-        """What a prior of one scale a bias makes of those of a flat prior."""
+        """The blocks under a prior of one scale per bias, from those under a flat prior."""
         eye = np.eye(self.members.shape[1])[None]
         return self._replace(covariance=np.linalg.inv(np.linalg.inv(self.covariance) + eye))
 

@@ -163,7 +163,7 @@ def _data_groups(answer: Answer, draws: Draws, before: Point, large: bool) -> di
 
 
 def _attrs(answer: Answer) -> dict[str, Any]:
-    """What was asked for, what ran, and how it ended."""
+    """The attributes of a tree: the request, the method that ran, and the status."""
     found = answer.posterior.summary
     stated = found.precisions == "given" and answer.prior.hierarchical  # it governs no bias
     intervals = (answer.prior.note if found.kind == "Laplace" else "") or answer.method.note(answer.prior)

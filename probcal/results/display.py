@@ -1,4 +1,4 @@
-"""What a notebook shows first of a result: status, message, the table of biases; behind them the tree as it is."""
+"""The first view of a result in a notebook: status, message, table of biases, then the tree."""
 
 from __future__ import annotations
 

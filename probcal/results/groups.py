@@ -61,7 +61,7 @@ def datum_of(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
 
 
 def data_columns(datum: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """What `datum_of` says of every datum, a column by name."""
+    """The coordinates of every datum from `datum_of`, one column per name."""
     return {name: values for name, (_, values) in datum["coords"].items()}
 
 

@@ -117,7 +117,7 @@ def check_content(tree: xr.DataTree, path: Path) -> None:
 
 
 def _faults(tree: xr.DataTree) -> Iterator[str]:
-    """What a fit lacks, or holds and no fit can hold, as a sentence goes on after the name of its file."""
+    """The missing or invalid parts of a fit, each to be read after the name of its file."""
     if "calibration" not in tree.children or not set(SUMMARY[1:]) <= set(tree["calibration"].variables):
         yield " is not a fit written by probcal: its group calibration is missing or incomplete"
     if (found := tree.attrs.get("results_version")) != RESULTS_VERSION:

@@ -1,4 +1,4 @@
-"""What readers take from a tree: one row a bias, outliers, and a calibration for other data."""
+"""The readers of a tree: one row per bias, outliers, and a calibration for other data."""
 
 from __future__ import annotations
 
@@ -239,7 +239,7 @@ def _began(problem: Problem, calibration: xr.DataTree, group: xr.Dataset) -> flo
 
 
 def apply(problem: Problem, calibration: xr.DataTree) -> Calibrated:
-    """What a fit found, for another problem of its network; biases and levels are matched by label.
+    """Applies a fit to another problem of its network; biases and levels are matched by label.
 
     Biases that the fit held are held; a level that it did not estimate stays at its guess. Raises `InputError` if the
     calibration lacks a bias, or ended without an answer.

@@ -122,7 +122,7 @@ def matrix_of(group: Any, name: str, whose: str) -> Any:
 
 
 def evidence_in(names: Container[Hashable]) -> str:
-    """Which of the evidences is among some names, empty where there is none."""
+    """The name of the evidence among some names, empty if there is none."""
     return next((name for name in EVIDENCES if name in names), "")
 
 

@@ -1,4 +1,4 @@
-"""What a truth says of a saved fit: position and bias error, coverage."""
+"""The scores of a saved fit by a truth: position and bias error, coverage."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def _grid(problem: Problem, point: Point) -> tuple[np.ndarray, np.ndarray, float
 
 
 def _over(problem: Problem, point: Point, s: int, grid: tuple[np.ndarray, np.ndarray, float]) -> np.ndarray | None:
-    """How far each place (y, x) of a grid is in the view of sensor s; None where it has no row."""
+    """The degree to which each grid place (y, x) is in the view of sensor s; None without rows."""
     model, sensor = problem.model, problem.network.sensors[s]
     assert sensor.detection is not None
     assert sensor.detection.view is not None

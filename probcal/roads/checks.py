@@ -1,4 +1,4 @@
-"""What makes a road network unusable, each in one sentence that names the edge."""
+"""The faults that make a road network unusable, each in one sentence that names the edge."""
 
 from __future__ import annotations
 

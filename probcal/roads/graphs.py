@@ -30,7 +30,7 @@ class EdgeList:
 
 
 def direction(name: str, value: Any) -> int:
-    """What `oneway` says: 1 from start to end, -1 from end to start, 0 both ways."""
+    """The direction of `oneway`: 1 from start to end, -1 from end to start, 0 both ways."""
     text = str(value).strip().lower()
     for answer, words in ((1, YES), (-1, BACKWARD), (0, NO)):
         if text in words:

@@ -101,7 +101,9 @@ class Road(Motion):
 
     @property
     def limit(self) -> float | None:
-        """How far in m beyond an edge its paths are known: `reach`, or what the longest step needs; None without."""
+        """The distance in m beyond an edge to which its paths are known: `reach`, or the longest
+        step's need, or None.
+        """
         if self.reach is not None or self.longest is None:
             return self.reach
         T = self.longest

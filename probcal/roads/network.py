@@ -135,12 +135,12 @@ class RoadNetwork:
 
     @cached_property
     def offsets(self) -> np.ndarray:
-        """Where each edge begins on the line of all edges end to end, in m, shape (E,)."""
+        """The start of each edge on the line of all edges end to end, in m, shape (E,)."""
         return np.cumsum(self.lengths) - self.lengths
 
     @cached_property
     def marks(self) -> np.ndarray:
-        """Where each segment begins on that line, in m, shape (S,)."""
+        """The start of each segment on that line, in m, shape (S,)."""
         return self.offsets[self.segments.edge] + self.segments.begin
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Where a source stands that several nodes hear, its power and the exponent unknown: separable least squares.
+"""Localises a source heard by several nodes, power and exponent unknown: separable least squares.
 
 Per kind of sensor i the level is theta_1,i + theta_3,i c_m(x), c_m = 10 log10 |x - p_m|, gains removed. For a place x
 the two parameters have a closed form (RSS paper 7), and what is left is a function of x alone.

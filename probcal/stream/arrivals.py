@@ -50,7 +50,7 @@ class CarriedTarget:
 
 @dataclass
 class Arrivals:
-    """What turns rows into epochs.
+    """Converts rows into epochs.
 
     A row that cannot be meant (`probcal.plausible`, beside the last values of each column) or that the calibration
     has counted is refused. A row that is earlier than the time up to which its target was filtered is late (where
@@ -310,7 +310,7 @@ class Arrivals:
         return declared_target(self.motion, name, self.network)
 
     def _group(self, name: str) -> str:
-        """What targets have in common whose motion is declared once."""
+        """The group of a target: targets whose motion is declared once share it."""
         return str(name) if isinstance(self.motion, Mapping) or name == NOBODY else ""
 
     def _freeze(self, problem: Problem) -> None:
@@ -380,7 +380,7 @@ class Arrivals:
             self.targets[name] = CarriedTarget(r, free, -np.inf)
 
     def _recursion(self, template: Problem, name: str) -> int:
-        """Which recursion a target belongs to: that of a sample with the same motion."""
+        """The index of a target's recursion: that of a sample with the same motion."""
         mine = self._group(name)
         assert self.samples is not None
         like = str(self.samples.loc[self.samples["_group"] == mine, "target"].iloc[0])

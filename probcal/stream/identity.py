@@ -30,7 +30,7 @@ STEPS = (0.3, 7.0)  # s, two unlike steps at which the linear form of a motion i
 def declared_identity(
     network: Network, motion: Any, calibration: xr.DataTree | None, **settings: Any
 ) -> dict[str, str]:
-    """What streams must share to be one stream, by the name that an error gives it; no row is part of it."""
+    """The declarations that streams must share to be one stream, by their names in errors; no rows."""
     found = {name.replace("_", " "): setting_text(value) for name, value in settings.items()}
     motions = {f"motion of {name}": own for name, own in motion.items()} if isinstance(motion, Mapping) else {}
     parts: dict[str, Any] = {f"sensor {own.name}": own for own in network.types}
@@ -81,7 +81,7 @@ def _stated(value: Any, dimension: int) -> Any:
 
 
 def _computed(value: Any, dimension: int) -> dict[str, Any]:
-    """What the functions of a channel's noise or of a motion compute, which its fields need not say."""
+    """The computations of a channel's noise or of a motion, which its fields need not state."""
     if isinstance(value, Channel):
         noise, number = value.noise, jax.ShapeDtypeStruct((), float)
         known: Any = noise.at(0.0) if isinstance(noise, Heard) and noise.floor is None else at_guess(noise)

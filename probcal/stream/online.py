@@ -184,7 +184,7 @@ class Jump(NamedTuple):
 
 
 class Update(NamedTuple):
-    """What rows made known."""
+    """The results of new rows."""
 
     time: float  # s, of the last epoch
     epochs: int  # that were filtered for good
@@ -431,7 +431,7 @@ class Online:
 
     @contextmanager
     def _unchanged_if_refused(self) -> Iterator[None]:
-        """Where what is inside raises, or is broken off, the filter stays as it was: no row counts twice or by half."""
+        """Restores the filter if the code inside fails or is interrupted: no row counts twice or in part."""
         own = self.__dict__ | {"doubts": self.doubts.copy(), "check": self.check.copy()}
         beside = self.arrivals.copy()
         try:
@@ -787,7 +787,7 @@ class Online:
         return min(left, size), size, (1 + many) * SEGMENTS
 
     def _points(self, batch: Batch) -> RowPoints:
-        """Where the epochs of a batch were linearised last, and where new targets may be."""
+        """The last linearisation points of a batch's epochs, and possible places of new targets."""
         problem = self._problem
         K, M = len(batch.time), problem.model.biases
         xs = [np.zeros((K, p.drift.shape[1])) for p in problem.model.recursions]

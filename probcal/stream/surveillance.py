@@ -84,7 +84,7 @@ class Event:
 
 
 class Tallies(NamedTuple):
-    """What is kept of each of K channels; sums are of 32, 64, ... innovations over the root of their number."""
+    """Tallies of K channels; sums are of 32, 64, ... innovations over the root of their number."""
 
     seen: np.ndarray  # (K,) data
     held: np.ndarray  # (K,) of them held back
@@ -190,7 +190,7 @@ def _rate(channels: int, level: Any, number: Any) -> Any:
 
 @dataclass
 class Surveillance:
-    """What the innovations of a stream have shown so far; its memory does not grow with the stream."""
+    """The findings from a stream's innovations so far; memory does not grow with the stream."""
 
     network: Network
     odds: float  # probability of a datum of the right model to be held back
@@ -379,7 +379,7 @@ class Surveillance:
         return int(self.tallies.seen.sum())
 
     def text(self) -> str:
-        """What it found, in sentences; empty where nothing speaks against the model."""
+        """The findings, in sentences; empty if nothing contradicts the model."""
         if names := self.unexplained:
             return (
                 f"The model does not explain {listed(names)}: {self.outliers / max(self.seen, 1):.0%} of all data lie"

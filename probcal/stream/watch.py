@@ -100,7 +100,7 @@ class Source:
         return self.rest.rpartition(b"\n")[0] + b"\n" if self.rest.count(b"\n") > 1 else b""
 
     def last(self) -> bytes:
-        """What stands behind the last line end, where no more will come."""
+        """The bytes after the last line end, when no more will come."""
         rest, self.rest = self.rest, b""
         return rest if rest.strip() else b""
 
@@ -296,7 +296,7 @@ class Watching:
 
     @contextmanager
     def undisturbed(self) -> Iterator[None]:
-        """What is inside comes to its end: who is told to end meanwhile ends behind it."""
+        """Completes the code inside: a request to end meanwhile takes effect after it."""
         self.busy = True
         yield
         self.busy = False

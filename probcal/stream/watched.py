@@ -66,7 +66,7 @@ class FilteredStream(Protocol):
 
 
 class Watched:
-    """What the tree says of the method."""
+    """The description of the method in the tree."""
 
     name: ClassVar[str] = "online filter"
     chooses: ClassVar[bool] = False
@@ -78,7 +78,7 @@ class Watched:
         return repr(self.settings)
 
     def note(self, prior: Prior) -> str:
-        """What the intervals are worth."""
+        """Describes the validity of the intervals."""
         return "Gaussian: rows linearised as they came, noise levels and precisions held"
 
 

@@ -1,4 +1,4 @@
-"""What the runs of a simulation-based calibration say together: uniformity, coverage of intervals, a verdict."""
+"""The results of all runs of a simulation-based calibration: uniformity, coverage, a verdict."""
 
 from typing import Any
 

@@ -42,7 +42,7 @@ Record = Mapping[str, Any]
 
 
 class _Layout(NamedTuple):
-    """What the dims of the arrays are."""
+    """The dims of the arrays."""
 
     axes: dict[str, list[Any]]
     methods: list[str]

@@ -61,7 +61,7 @@ def draw_data(model: Model, point: Point, key: jax.Array) -> tuple[jax.Array, ..
 
 
 def far_start(problem: Problem) -> float:
-    """How wide the start of a target is, in extents of the network: above 1 the prior's tracks pass far from it."""
+    """The width of a target's start in network extents: above 1, prior tracks pass far from it."""
     widest = 0.0
     for part, epochs in problem.model.each_layout(problem.epochs):
         begins = ~np.asarray(part.F).any((1, 2))

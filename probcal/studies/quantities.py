@@ -1,4 +1,4 @@
-"""What is ranked in a simulation: every bias, level and shared hyper-parameter, the track, and the data's density.
+"""The ranked quantities: biases, levels, shared hyper-parameters, the track, the data's density.
 
 The density of the data is a quantity that depends on them: ranks of parameters alone cannot see a method that ignores
 part of the data (Modrak et al. 2023).

@@ -154,7 +154,7 @@ def short(method: Method) -> Method:
 
 
 class _Engine:
-    """What every run shares."""
+    """The settings that every run shares."""
 
     def __init__(
         self, problem: Problem, method: Method, prior: Prior, source: Prior, around: Any, start: str, draws: int,
@@ -185,7 +185,7 @@ class _Engine:
             self.pool = self._fit(self.problem, None, jax.random.fold_in(self.key, 2**31 - 1))
 
     def identity(self) -> dict[str, str]:
-        """What runs must share to be counted together."""
+        """The settings that runs must share to be counted together."""
         around = self.around + (points_digest(self.pool.points) if self.pool else "")
         return identity_of(
             self.problem, method=self.method, prior=self.prior, prior_of_the_truths=self.source, start=self.start,
@@ -317,7 +317,7 @@ def _tree(engine: _Engine, records: dict[int, dict[str, np.ndarray]], interrupte
 
 
 def _message(engine: _Engine, tree: xr.DataTree, failed: dict[int, str], interrupted: bool) -> str:
-    """What to know before the numbers are believed."""
+    """The warnings to read before the numbers are used."""
     parts = []
     if failed:
         parts.append(

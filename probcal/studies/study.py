@@ -44,7 +44,7 @@ Setting = Callable[..., tuple[Problem, Truth]]
 
 
 class _Solved(NamedTuple):
-    """Where a run ended."""
+    """The final state of a run."""
 
     state: State
     mixed: Integrated | None  # where precisions are integrated after the climb
@@ -219,7 +219,7 @@ def _prepared(method: Method, run: _Run) -> _Run:
 
 
 def _record(run: _Run, answer: Answer) -> dict[str, Any]:
-    """What a study keeps of an answer, judged by the truth."""
+    """The record of an answer in a study, judged by the truth."""
     problem, found = answer.problem, answer.posterior.summary
     true = np.array([run.truth.biases[label] for label in problem.labels]) / problem.scales
     error, lower, upper = found.mean - true, found.lower - true, found.upper - true

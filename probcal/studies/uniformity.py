@@ -86,7 +86,7 @@ def spread_p_value(places: np.ndarray) -> float:
 
 
 def shape(places: np.ndarray) -> str:
-    """What is wrong with a posterior whose places (R, ...) are uneven, in words."""
+    """Describes the fault of a posterior whose places (R, ...) are uneven, in words."""
     runs = len(places)
     centre = (places.mean() - 0.5) * np.sqrt(12 * runs)
     spread = (np.abs(places - 0.5).mean() - 0.25) * np.sqrt(48 * runs)

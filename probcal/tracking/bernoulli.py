@@ -32,7 +32,9 @@ Carry = tuple[BernoulliTracks, jax.Array]  # and the mean number of objects neve
 
 
 class Step(NamedTuple):
-    """What a scan says: the tracks after it, those before, and how surely each slot is of each of these or new."""
+    """The result of a scan: the tracks after and before it, and the probability that each slot is
+    of each of these or new.
+    """
 
     after: BernoulliTracks
     number: jax.Array  # (T,) of the tracks before

@@ -1,4 +1,4 @@
-"""What the verbs on detections without names are asked, checked and made arrays."""
+"""The inputs of the verbs on detections without names, checked and converted to arrays."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def object_groups(problem: Problem, objects: Objects, z: Any) -> dict[str, xr.Da
 
 
 def belief_group(beliefs: Beliefs) -> xr.Dataset:
-    """How beliefs went: mean and sd of each bias by iteration, how each sensor was placed, and the edges."""
+    """The history of beliefs: mean and sd of biases per iteration, sensor placement, and edges."""
     trace = beliefs.trace
     rounds = trace.drop_duplicates("iteration").set_index("iteration")[["phase", "seconds"]]
     found = trace.set_index(["iteration", "bias"])[["mean", "sd"]].to_xarray().rename(bias="bias_label")
@@ -110,7 +110,7 @@ def disagreeing(problem: Problem, objects: Objects, z: Any) -> list[tuple[str, s
 
 @partial(jax.jit, static_argnames=("views",))
 def _in_view(watch: Watch, views: tuple[View, ...], scan: jax.Array, x: jax.Array, z: jax.Array) -> jax.Array:
-    """How far an object at x (N, n) is in the view of the sensor of a scan (N,), from 0 to 1."""
+    """The degree, 0 to 1, to which an object at x (N, n) is in view of a scan's sensor (N,)."""
 
     def one(k: jax.Array, x: jax.Array) -> jax.Array:
         own = jax.tree.map(lambda leaf: leaf[k], watch.scans)

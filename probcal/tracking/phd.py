@@ -45,7 +45,7 @@ class Intensity(NamedTuple):
 
 
 class Passed(NamedTuple):
-    """What a filter knows at each of K scans (leading), of objects detected at least once and of their number."""
+    """The belief at each of K scans (leading): objects detected at least once, and their number."""
 
     before: Intensity  # predicted to the scan
     after: Intensity
@@ -56,7 +56,7 @@ class Passed(NamedTuple):
 
 
 class _Detections(NamedTuple):
-    """What the slots of a scan say of the predicted components and of objects never detected."""
+    """The likelihood terms of a scan's slots, for predicted components and undetected objects."""
 
     there: jax.Array  # (D,)
     chance: jax.Array  # (J,) of detection
@@ -67,7 +67,7 @@ class _Detections(NamedTuple):
 
 
 class _Shares(NamedTuple):
-    """What becomes of the parts: factors of what was missed, and of each slot's pairs; and what the scan is worth."""
+    """The factors for missed objects and for each slot's pairs, and the scan's log-likelihood."""
 
     missed: jax.Array  # () factor, besides the chance of being missed
     slot: jax.Array  # (D,) log factor of the pairs of each slot
@@ -363,7 +363,7 @@ def phd_filter(
 
 
 def _tables(passed: Passed, problem: Problem) -> Intensities:
-    """What was passed, K leading, with its names."""
+    """The results of the filter, K leading, as tables with names."""
     scans = problem.scans
     assert scans is not None
     number, time = np.arange(len(scans)), scans.time

@@ -20,7 +20,8 @@ APART = 3.0  # cuts by which the tracks of a rival lie elsewhere
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """How the second frame lies in the first, `first = turn(heading) second + position`, at times `second + clock`.
+    """The place of the second frame in the first: `first = turn(heading) second + position`, at times
+    `second + clock`.
 
     `sd` holds the standard deviations of heading (rad), position (d,) in m and clock (s), those of straight tracks with
     independent errors of `std` m. `pairs` lists first, second, seconds and rms in m. `rivals` counts other frames that

@@ -28,7 +28,7 @@ class Scan(NamedTuple):
 
 
 class Watch(NamedTuple):
-    """What a tracker reads: the model of one object, its scans and its start."""
+    """The inputs of a tracker: the model of one object, its scans and its start."""
 
     model: Model
     scans: Scan
@@ -127,5 +127,5 @@ def detected(model: Model, scan: Scan, views: tuple[View, ...], x: jax.Array, z:
 
 
 def present(scan: Scan) -> jax.Array:
-    """Which slots (D,) hold a detection."""
+    """The mask (D,) of the slots that hold a detection."""
     return jnp.concatenate([jnp.any(seen.mask > 0, 1) for seen in scan.epoch.rows])

@@ -69,7 +69,7 @@ class SelfConfiguration(Method):
 
     @property
     def expected(self) -> dict[str, Any]:
-        """What is expected of objects."""
+        """The settings of expected objects: number, births and lifetime."""
         return {name: getattr(self, name) for name in ("objects", "births", "lifetime")}
 
     @property
@@ -82,11 +82,11 @@ class SelfConfiguration(Method):
         return self.method.first_prior()
 
     def takes(self, prior: Prior) -> bool:
-        """What the method within takes."""
+        """Returns True if the method within takes this prior."""
         return self.method.takes(prior)
 
     def note(self, prior: Prior) -> str:
-        """What the intervals are worth: those of the method within, associations held."""
+        """The validity of the intervals: that of the method within, associations held."""
         return f"{self.method.note(prior)}; the associations are held at their weights"
 
     def configured(

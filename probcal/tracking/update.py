@@ -1,4 +1,4 @@
-"""What a scan says of one Gaussian: its rows seen from a state, the state after each, and objects not seen before.
+"""The update of one Gaussian by a scan: rows at a state, the state after each, and new objects.
 
 Trackers of objects without names share these (Bernoulli tracks, intensities).
 """

@@ -1,4 +1,4 @@
-"""What is known of biases and targets at a moment: the augmented Gaussian in separated form, by square roots.
+"""The belief about biases and targets at one time: a separated augmented Gaussian, by square roots.
 
 Given the biases z the targets are independent, so that the joint Gaussian of z and all states is that of z,
 N(mean, root root'), and of each target a line in z with a covariance of its own: x | z ~ N(m + B z, R R') (Friedland
@@ -72,7 +72,7 @@ DECIDE, ADMIT, HOLD = 0, 1, 2  # whether a datum is held back: by its residual, 
 
 
 class KeptDatum(NamedTuple):
-    """What the smoother needs of one datum: c = g'z + e given the states before."""
+    """The terms that the smoother needs per datum: c = g'z + e given the states before."""
 
     hx: jax.Array  # (n,) over the std of the datum given z
     gain: jax.Array  # (n,) of x by c

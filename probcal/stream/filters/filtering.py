@@ -38,7 +38,7 @@ class FilterForm:
 
 
 class FilterGiven(NamedTuple):
-    """What stays the same over a stream."""
+    """The quantities that stay the same over a stream."""
 
     levels: jax.Array  # (H,) log factors of the noise levels
     walk: jax.Array  # (M,) standard deviation of the step of each bias over a second
@@ -46,7 +46,7 @@ class FilterGiven(NamedTuple):
 
 
 class RowPoints(NamedTuple):
-    """Where the rows of epochs are linearised: at these points, or, where there are none, at the belief."""
+    """The points at which the rows of epochs are linearised; if none, the belief is used."""
 
     x: tuple[jax.Array, ...]  # (n,) of each recursion
     z: jax.Array  # (M,)
@@ -55,7 +55,7 @@ class RowPoints(NamedTuple):
 
 
 class EpochStep(NamedTuple):
-    """What one epoch leaves, of each recursion; where it belongs to another one all is zero."""
+    """The results of one epoch per recursion; all zero if the epoch belongs to another."""
 
     x: tuple[jax.Array, ...]  # (n,) filtered mean of its target
     sd: tuple[jax.Array, ...]  # (n,)
@@ -88,7 +88,7 @@ def epoch_step(
 
 
 def either(there: jax.Array, function: Any, belief: Any) -> tuple[Any, Any]:
-    """What a function makes of a belief where it is to be called, else the belief and zeros."""
+    """Applies a function to a belief if it is to be called, else returns the belief and zeros."""
     shapes = jax.eval_shape(lambda b: function(b)[1], belief)
     nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
     return jax.lax.cond(there, function, lambda b: (b, nothing), belief)
@@ -130,7 +130,7 @@ def _epoch(
 
 
 def _scanned(use: Any, carry: Any, rows: WhiteRow) -> tuple[Any, KeptDatum]:
-    """What the data of an epoch make of a carry, one after another; those that are missing change nothing."""
+    """Updates a carry by the data of an epoch, one after another; missing data change nothing."""
 
     def each(carry: Any, row: WhiteRow) -> tuple[Any, KeptDatum]:
         return either(jnp.any(row.hx != 0) | jnp.any(row.hz != 0), lambda old: use(old, row), carry)

@@ -37,7 +37,7 @@ class SmoothedStates(NamedTuple):
 
 
 class WindowPass(NamedTuple):
-    """What a window leaves."""
+    """The results of a window."""
 
     beliefs: Augmented  # at the end of each segment, leading
     smoothed: SmoothedStates

@@ -16,7 +16,7 @@ from probcal.stream.filters.belief import Augmented, Slots, WhiteRow
 
 
 class About(NamedTuple):
-    """Where rows are linearised: a state and the biases."""
+    """The point at which rows are linearised: a state and the biases."""
 
     x: jax.Array  # (n,)
     z: jax.Array  # (M,)

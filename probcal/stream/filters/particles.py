@@ -34,7 +34,7 @@ class Cloud(NamedTuple):
 
 
 class CloudPass(NamedTuple):
-    """What each epoch leaves (K leading)."""
+    """The results of each epoch (K leading)."""
 
     x: tuple[jax.Array, ...]  # (n,) mean of what rows see of its target, of each recursion
     sd: tuple[jax.Array, ...]  # (n,)

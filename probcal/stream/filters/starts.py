@@ -1,4 +1,4 @@
-"""Where a target that has just come can be: the place that explains its first rows best, of many that are tried.
+"""The start of a new target: the place that explains its first rows best, of many that are tried.
 
 Everything else of its state is at the start that is declared, and the noise is widened by what is not known of the
 biases, with the robust loss of the batch start. Residuals count by the std of their noise, whatever its family: the

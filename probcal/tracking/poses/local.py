@@ -30,7 +30,7 @@ class Alone:
 
     @property
     def form(self) -> Any:
-        """What sensors share that one compiled kernel serves."""
+        """The form that sensors share if one compiled kernel serves them."""
         return jax.tree.structure(self.watch), self.views
 
 

@@ -20,7 +20,7 @@ from probcal.types import float64
 
 @dataclass(frozen=True, eq=False)
 class Beliefs:
-    """What the detections of its sensors say of a network: means z (M,) of the biases and covariance (M, M), in scales.
+    """The beliefs from all detections: bias means z (M,) and covariance (M, M), in scales.
 
     Each detection counts in the likelihood of every pair of its sensor; the covariance is widened by the number of
     pairs. `sensors` has a line a vertex (sensors that share a node), how it was placed and with which evidence, in nats

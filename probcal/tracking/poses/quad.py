@@ -1,4 +1,4 @@
-"""What normalises the quad term of a separable likelihood (Separable likelihoods 6), for tracks of two sensors.
+"""The normaliser of the quad term (Separable likelihoods 6), for tracks of two sensors.
 
 The term is the geometric mean of two densities of the detections of both sensors at one time: one by what the first
 knew before, one by what the second knew. For an object that both track these are Gaussian, and what the mean lacks to
@@ -61,7 +61,7 @@ def normaliser(each: Paired, z: jax.Array, theta: jax.Array, at: jax.Array) -> C
         sides = ((each.model, first_slot(scan)), (each.other, first_slot(stand)))
 
         def seen(x: jax.Array, theta: jax.Array, owner: int) -> tuple[jax.Array, ...]:
-            """What both would measure of a state that one of them tracks."""
+            """The values that both would measure for a state that one of them tracks."""
             whole = z.at[at].set(theta)
             where = go_along(*sides[owner], x, whole)
             return tuple(model.predict_at(s.epoch, (where[None],), whole)[0][0] for model, s in sides)

@@ -24,7 +24,7 @@ TERMS = ("dual", "quad")
 
 
 class Explained(NamedTuple):
-    """What is needed to explain the scans of one sensor by another's mixtures (K scans, J components)."""
+    """The inputs to explain one sensor's scans by another's mixtures (K scans, J components)."""
 
     model: Model  # of the sensor that is explained
     scans: Scan
@@ -87,7 +87,7 @@ def explained(
     problem: Problem, one: Alone, other: Alone, after: Intensity, count: np.ndarray, window: float, lifetime: float, *,
     before: bool,
 ) -> Explained:  # fmt: skip
-    """What explains the scans of `one` by the mixtures (K, J) that the `other` has after its own scans."""
+    """The inputs to explain the scans of `one` by mixtures (K, J) of `other` after its scans."""
     pair = matched_scans(one, other, window, before=before)
     behind = np.maximum(pair, 0)
     mixture = carry(problem, after, behind, np.where(pair >= 0, one.time - other.time[behind], 0.0), lifetime)
@@ -129,7 +129,7 @@ def go_along(model: Model, scan: Scan, x: jax.Array, z: jax.Array) -> jax.Array:
 
 
 class Told(NamedTuple):
-    """What each component of a mixture says of the slots of a scan: chance of detection, log density, and its slope.
+    """The terms per mixture component for a scan's slots: detection chance, log density, slope.
 
     Minus the second derivative is that of Gauss and Newton: the covariance of the prediction is held.
     """

@@ -79,7 +79,7 @@ class Graph:
         return total
 
     def pair(self, i: int, j: int, z: np.ndarray, at: np.ndarray) -> Potential:
-        """What two sensors tell each other, as a function of the biases at some places of z."""
+        """The potential between two sensors, as a function of the biases z[at]."""
         terms, quad = [], []
         settings = self.window, self.lifetime
         for a, b in ((i, j), (j, i)):
@@ -97,7 +97,7 @@ class Graph:
         return np.array([2 * np.pi / scales[m] if biases[m].component in ANGLES else np.inf for m in at])
 
     def potential(self, u: int, v: int, z: np.ndarray, at: np.ndarray) -> Potential:
-        """What the sensors of two vertices tell each other, as a function of the biases at some places of z."""
+        """The potential between the sensors of two vertices, as a function of the biases z[at]."""
         own, others = self.vertices[u].sensors, self.vertices[v].sensors
         parts = [self.pair(i, j, z, at) for i in own for j in others]
         terms = tuple(term for part in parts for term in part.terms)

@@ -45,7 +45,7 @@ BEGIN = 2**31 - 1  # number of the key of the first hyper-parameters, beyond all
 
 
 class Chain(NamedTuple):
-    """Where a chain stands."""
+    """The state of a chain."""
 
     at: Standing  # of density minus infinity before the first move, which is then taken
     phi: Phi  # hyper-parameters of the prior
@@ -159,7 +159,7 @@ def sample_associations(
 
 
 def scene_of(problem: Problem, prior: Prior, objects: float, z: np.ndarray) -> tuple[Recording, tuple[View, ...], Any]:
-    """What the moves read, the views, and the row of the table behind every slot (K, D) of the scans, -1 of none."""
+    """The data for the moves, the views, and the table row of each scan slot (K, D), -1 if none."""
     own, watch, views, _, _, cloud = asked(
         "sample_associations", problem, None, None, objects=objects, births=1.0, lifetime=1.0, most=1, sensors=()
     )
@@ -240,7 +240,7 @@ def _check(problem: Problem, prior: Prior, objects: float, most: int, draws: int
 
 
 def _starts(found: Objects, rows: np.ndarray, most: int, chains: int) -> Association:
-    """Where chains begin: even ones at the tracks that hold most detections, odd ones without any object."""
+    """The starts of chains: even ones at the tracks with most detections, odd ones empty."""
     K, D = rows.shape
     choice, there = np.full((chains, most, K), D), np.zeros((chains, most), bool)
     held = found.rows[found.rows["weight"] > SURE].groupby("track")["weight"].sum()
@@ -331,7 +331,7 @@ def _tree(problem: Problem, kept: AssociationDraw, rows: np.ndarray, schedule: S
 
 
 def split_r_hat(draws: np.ndarray) -> float:
-    """How far the halves of chains (C, N) lie apart against the spread within, of numbers that many draws share."""
+    """The split R-hat of chains (C, N): spread between halves over that within; allows ties."""
     n = draws.shape[1] // 2
     halves = np.concatenate([draws[:, :n], draws[:, -n:]]) if n > 1 else draws
     n = halves.shape[1]

@@ -98,7 +98,7 @@ class Drawn(NamedTuple):
 
 
 def left_by(move: jax.Array, a: Association, D: int, key: jax.Array) -> tuple[Association, jax.Array]:
-    """What a move leaves of an association, and which scan or slot it will fill."""
+    """The part of an association that a move leaves, and the scan or slot that it will fill."""
     T, K = a.choice.shape
     slot, scan = jax.random.randint(key, (), 0, T), jax.random.randint(key, (), 0, K)
     chosen = jnp.where(move == TRACK, slot, scan)
@@ -318,7 +318,7 @@ def move(
         )
 
     def pass_(carry: tuple[Fit, Proposal], first: jax.Array) -> tuple[tuple[Fit, Proposal], Fit]:
-        """What is left is fitted and completed, then the proposal is fitted: one code for both."""
+        """Fits and completes what is left, then fits the proposal: one code for both."""
         _, found = carry
         fit = fitted(scene, views, found.a)
         return (fit, jax.lax.cond(first, propose, lambda _: found, fit)), fit

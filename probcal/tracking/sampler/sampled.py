@@ -36,7 +36,7 @@ class Association(NamedTuple):
 
 
 class First(NamedTuple):
-    """What each detection (K, D) says by itself of an object: evidence, state, and its rows about that state."""
+    """The terms of each detection (K, D) alone: evidence, object state, rows about that state."""
 
     evidence: jax.Array  # (K, D) with the probability of detection
     mean: jax.Array  # (K, D, n)
@@ -47,7 +47,7 @@ class First(NamedTuple):
 
 
 class Recording(NamedTuple):
-    """What the moves read of a problem; a pytree, so that one kernel serves every association and every recording."""
+    """The data that the moves read; a pytree: one kernel serves all associations and recordings."""
 
     watch: Watch
     epoch: jax.Array  # (K,) of each scan in the recursion
@@ -76,7 +76,7 @@ class Fit(NamedTuple):
 
 @partial(jax.jit, static_argnames="views")
 def first_of(watch: Watch, views: tuple[View, ...], cloud: jax.Array, z: jax.Array) -> First:
-    """What each detection says by itself, the start of the motion carried to its scan, biases at z with sd 1."""
+    """The terms of each detection alone: motion start carried to its scan, biases at z, sd 1."""
     known = Biases(z, jnp.eye(len(z)), jnp.zeros(watch.model.level_spread.shape[0]))
 
     def carried(carry: tuple[jax.Array, jax.Array], move: Move) -> Any:
