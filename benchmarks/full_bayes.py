@@ -106,7 +106,7 @@ def arrival(name: str, tree: xr.DataTree) -> str:
 
 
 def apart(ea: xr.DataTree, full: xr.DataTree) -> xr.Dataset:
-    """How far the biases of an EA are from full Bayes: `mean` in sds of that, `sd` as a ratio, `gamma`."""
+    """The differences of an EA from full Bayes per bias: `mean` in sds of the latter, `sd` as a ratio, `gamma`."""
     a, b = (tree["calibration"].to_dataset()[["mean", "sd", "gamma"]] for tree in (ea, full))
     return xr.Dataset(
         {"mean": (a["mean"] - b["mean"]) / b["sd"], "sd": a["sd"] / b["sd"], "gamma": a["gamma"] - b["gamma"]}

@@ -788,7 +788,7 @@ def test_em_on_any_engine_is_that_of_the_dense_one(step):
 
 
 @pytest.mark.needs("particles", "tracking")
-def test_the_table_of_engines_stands_in_the_readme():
+def test_the_table_of_engines_stands_in_the_guide():
     assert engines.table() in engines.GUIDE.read_text(), "run python tests/engines.py"
 
 

@@ -28,7 +28,7 @@ ROUNDS = 4  # trajectories at which that acceptance is judged, each by as small 
 TAILED = 25  # draws below which a Pareto tail cannot be fitted
 FITTINGS, FITTED = 2, 20  # rounds and draws (with mirror images) that a frame is fitted to
 SPREAD = 1.5  # by how much chains start further out than the pilot's draws
-DRAWN_IN = 0.3  # factor by which draws of a bad frame are drawn in, again and again
+DRAWN_IN = 0.3  # factor by which draws of a bad frame are scaled down, several times if needed
 
 
 class Pilot(NamedTuple):
@@ -170,8 +170,11 @@ def pose(
 
 
 def _nearby(form: Form, bad: Posed, key: jax.Array) -> tuple[Posed, Pilot]:
-    """A frame that does not fit, as if each entry of theta were also measured with sd 1, and draws
-    of it, drawn in towards its point until the joint density nearly follows them."""
+    """The frame as if each entry of theta were also measured with sd 1, and draws near its point.
+
+    Draws of a frame that does not fit lie where the joint density is absurd. They are scaled down
+    about the point until the density there is lower by no more than one nat per entry of theta.
+    """
     frame, share = bad.frame, 1.0
     near = bad._replace(frame=frame._replace(information=frame.information + jnp.eye(len(frame.theta))))
     found = pilot(form, near, key)
